@@ -1,0 +1,1 @@
+"""Video -> articulated, simulation-ready asset."""

@@ -1,0 +1,106 @@
+"""Cues: what pretrained models, trackers or a person say about a video, one dataclass a cue.
+
+All uv are full pixels (see :class:`reconstruct.video.Video`); T counts the working frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ProviderInfo:
+    """Who made a cue: carried into ``asset.json``."""
+
+    name: str
+    version: str
+    licence: str
+
+
+@dataclass(frozen=True)
+class HandTrack:
+    """One hand through the video.
+
+    Attributes:
+        side: "left" or "right".
+        uv: (T, 21, 2) landmarks in full px (MediaPipe order: 0 wrist, 4 thumb tip, 8 index tip,
+            12 middle tip, 16 ring tip, 20 little tip); NaN where not valid.
+        metric: (T, 21, 3) landmarks in metres about the hand's centre, camera axes (right, down,
+            forward); NaN where not valid.
+        score: (T,) presence score in [0, 1].
+        valid: (T,) bool.
+    """
+
+    side: str
+    uv: np.ndarray
+    metric: np.ndarray
+    score: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Hands:
+    """All hands of a video and the pixels that hands and bare arms cover.
+
+    Attributes:
+        tracks: the hands, longest first; empty if none was seen.
+        mask: (T, h, w) bool at working size.
+    """
+
+    tracks: tuple[HandTrack, ...]
+    mask: np.ndarray
+    provider: ProviderInfo
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Point tracks.
+
+    Attributes:
+        uv: (N, T, 2) full px (NaN where not visible).
+        visible: (N, T) bool.
+        reference: (N,) working frame in which each track was seeded.
+    """
+
+    uv: np.ndarray
+    visible: np.ndarray
+    reference: np.ndarray
+    provider: ProviderInfo
+
+
+@dataclass(frozen=True)
+class LinkMasks:
+    """Pixels of the moving link, of the static link's visible part, and of hands.
+
+    Attributes:
+        moving, static, hand: (T, h, w) bool at working size.
+        confidence: (T,) how well the moving mask is supported by tracks, [0, 1].
+    """
+
+    moving: np.ndarray
+    static: np.ndarray
+    hand: np.ndarray
+    confidence: np.ndarray
+
+
+@dataclass(frozen=True)
+class HandReference:
+    """The demonstration: what ``reference.npz`` holds (world frame, metres).
+
+    Attributes:
+        time: (T,) s.  q: (T,) joint state.
+        hand_joints: (T, 21, 3) world.  hand_valid: (T,) bool, False where filled in.
+        contact: (T,) bool, the frames in which the hand drives the part.
+        side: "left" or "right".
+        notes: what was assumed or could not be done.
+    """
+
+    time: np.ndarray
+    q: np.ndarray
+    hand_joints: np.ndarray
+    hand_valid: np.ndarray
+    contact: np.ndarray
+    side: str
+    notes: tuple[str, ...] = field(default_factory=tuple)

@@ -1,0 +1,1 @@
+"""From tracks to a joint: articulated structure from motion."""

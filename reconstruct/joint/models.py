@@ -1,0 +1,97 @@
+"""Kinematics of one joint, and the result of fitting one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def joint_transform(kind: str, axis: np.ndarray, point: np.ndarray | None, q: np.ndarray | float,
+                    pitch: float | None = None) -> np.ndarray:
+    """Pose of the moving link at state q relative to q = 0.
+
+    Args:
+        kind: "revolute", "prismatic" or "screw".
+        axis: (3,) unit direction, world.
+        point: (3,) a point on the axis, world (None for prismatic).
+        q: (...,) rad (revolute, screw) or m (prismatic).
+        pitch: m/rad (screw).
+
+    Returns:
+        (..., 4, 4) transforms that map the link's points at q = 0 to those at q, both in the world.
+    """
+    q = np.asarray(q, float)
+    axis = np.asarray(axis, float)
+    T = np.zeros((*q.shape, 4, 4))
+    T[..., 3, 3] = 1.0
+    if kind == "prismatic":
+        T[..., :3, :3] = np.eye(3)
+        T[..., :3, 3] = q[..., None] * axis
+        return T
+    if kind not in ("revolute", "screw"):
+        raise ValueError(f"unknown joint type {kind!r}; known: revolute, prismatic, screw")
+    R = Rotation.from_rotvec(q.reshape(-1, 1) * axis).as_matrix().reshape(*q.shape, 3, 3)
+    c = np.asarray(point, float)
+    T[..., :3, :3] = R
+    T[..., :3, 3] = c - R @ c
+    if kind == "screw":
+        T[..., :3, 3] += (pitch or 0.0) * q[..., None] * axis
+    return T
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """A joint, its states, and the moving link's points.
+
+    Attributes:
+        verdict: "ok", "ambiguous" or "refused"; reason: one sentence.
+        type: "revolute", "prismatic", "screw" or None; type_probability: per type.
+        axis: (3,) unit, world.  point: (3,) on the axis nearest to the link, world (None if prismatic).
+        q: (T,) state in every working frame, rad or m; q[0] = 0 is the geometry's reference state.
+        K: (3, 3) full px.  T_camera_world: (4, 4) of the (stabilised, static) camera.
+        points: (M, 3) moving link's points at q = 0, world.
+        point_track: (M,) index of each point's track in Tracks.
+        metric, scale_source: as in the contract; lengths are in units of the median depth otherwise.
+        std: {"axis_deg", "point_m", "q": (T,)}.
+        image_line: (2, 2) full px.
+        residual_px: median over inlier observations, full px.  inliers, tracks: counts.
+        moving_frames: (T,) bool, the frames in which the part moves.
+    """
+
+    verdict: str
+    reason: str
+    type: str | None = None
+    type_probability: dict[str, float] = field(default_factory=dict)
+    axis: np.ndarray | None = None
+    point: np.ndarray | None = None
+    pitch: float | None = None
+    q: np.ndarray | None = None
+    frames: np.ndarray | None = None
+    K: np.ndarray | None = None
+    T_camera_world: np.ndarray | None = None
+    points: np.ndarray | None = None
+    point_track: np.ndarray | None = None
+    metric: bool = False
+    scale_source: str = "none"
+    std: dict = field(default_factory=dict)
+    image_line: np.ndarray | None = None
+    residual_px: float | None = None
+    inliers: int = 0
+    tracks: int = 0
+    moving_frames: np.ndarray | None = None
+
+    @property
+    def unit(self) -> str:
+        return "m" if self.type == "prismatic" else "rad"
+
+    def link_pose(self, q: np.ndarray | float) -> np.ndarray:
+        """(..., 4, 4) link transform at q relative to q = 0, world."""
+        return joint_transform(self.type, self.axis, self.point, q, self.pitch)
+
+    def project(self, xyz_world: np.ndarray) -> np.ndarray:
+        """(..., 3) world -> (..., 2) full px."""
+        x = xyz_world @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
+        x = x @ self.K.T
+        return x[..., :2] / x[..., 2:]
