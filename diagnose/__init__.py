@@ -1,0 +1,1 @@
+"""Measured joint data against a simulated asset: what differs, and why."""
