@@ -1,0 +1,149 @@
+"""Global search: axis lines from one window of tracks, without a starting guess.
+
+For an axis direction a, a total angle and a motion profile, the rotations R_t are known, and a track's
+unknown depth lambda and the pivot c (perpendicular to a) enter linearly:
+
+    x_t x (lambda R_t x_0 + (I - R_t) c) = 0.
+
+The depth is eliminated per track, which leaves a 2 x 2 form in c; its smallest eigenvector over small
+random subsets of tracks gives pivots, and a truncated reprojection error over all tracks ranks them.
+A prismatic direction d enters in the same way: x_t x (lambda x_0 + s_t d) = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+ANGLES = np.radians([15.0, 35.0, 60.0, 90.0, 120.0])
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A joint in the camera frame (right, down, forward), up to scale.
+
+    Attributes:
+        kind: "revolute" or "prismatic".
+        axis: (3,) unit.  point: (3,) pivot perpendicular to the axis, unit length (revolute).
+        frames: (m,) frames of the window.  q: (m,) states there (rad; units of |point| or of depth).
+        score: explained motion, larger is better.
+    """
+
+    kind: str
+    axis: np.ndarray
+    point: np.ndarray | None
+    frames: np.ndarray
+    q: np.ndarray
+    score: float
+
+
+def hemisphere(count: int) -> np.ndarray:
+    """(count, 3) nearly even unit directions with z >= 0 (Fibonacci lattice)."""
+    i = np.arange(count) + 0.5
+    z = i / count
+    phi = np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+
+
+def perpendicular_basis(a: np.ndarray) -> np.ndarray:
+    """(..., 3) unit -> (..., 3, 2) orthonormal vectors perpendicular to it."""
+    helper = np.where(np.abs(a[..., :1]) < 0.7, np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
+    b1 = np.cross(a, helper)
+    b1 /= np.linalg.norm(b1, axis=-1, keepdims=True)
+    return np.stack([b1, np.cross(a, b1)], axis=-1)
+
+
+def _smallest_eigenvector_2x2(M: np.ndarray) -> np.ndarray:
+    """(..., 2, 2) symmetric -> (..., 2) unit eigenvector of the smaller eigenvalue."""
+    a, b, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 1]
+    angle = 0.5 * np.arctan2(2 * b, a - d)  # of the larger one
+    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+
+def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarray, weight: np.ndarray, tol: float,
+                        rng: np.random.Generator, directions: int = 160, subsets: int = 40, keep: int = 6) -> list[Hypothesis]:
+    """Axis lines from one window.
+
+    Args:
+        rays: (n, m, 3) rays (x, y, 1) of n tracks in m frames; frame 0 is the reference. NaN if not seen.
+        frames: (m,) frame numbers.
+        profile: (m,) motion profile, 0 at the reference and 1 at the largest motion.
+        weight: (n,) weight of each track (its motion, its share of the picture).
+        tol: truncation of the reprojection error, in ray units (px / focal).
+        rng: for the subsets.
+        directions, subsets, keep: size of the search and number of results.
+    """
+    n, m, _ = rays.shape
+    seen = np.isfinite(rays[..., 0])
+    x = np.where(seen[..., None], rays, 0.0)
+    dirs = hemisphere(directions)
+    angles = np.concatenate([ANGLES, -ANGLES])
+    picks = np.stack([rng.choice(n, size=min(5, n), replace=False, p=weight / weight.sum()) for _ in range(subsets)])
+    motion2 = np.nanmax(np.sum((rays - rays[:, :1]) ** 2, axis=-1), axis=1)
+    found: list[tuple[float, np.ndarray, np.ndarray, float]] = []
+    for theta in angles:
+        q = theta * profile
+        R = Rotation.from_rotvec((dirs[:, None] * q[None, :, None]).reshape(-1, 3)).as_matrix().reshape(directions, m, 3, 3)
+        basis = perpendicular_basis(dirs)
+        y = np.einsum("dmij,nj->dnmi", R[:, 1:], x[:, 0])
+        A = np.cross(x[None, :, 1:], y)                                  # (d, n, m-1, 3)
+        C = basis[:, None] - np.einsum("dmij,djk->dmik", R[:, 1:], basis)  # (I - R) basis
+        B = np.cross(x[None, :, 1:, None, :], np.swapaxes(C, -1, -2)[:, None])  # (d, n, m-1, 2, 3)
+        AA = np.einsum("dnmi,dnmi->dn", A, A) + 1e-12
+        AB = np.einsum("dnmi,dnmki->dnk", A, B)
+        BB = np.einsum("dnmki,dnmli->dnkl", B, B)
+        M = BB - AB[..., :, None] * AB[..., None, :] / AA[..., None, None]
+        scale = np.trace(BB, axis1=-1, axis2=-2)[..., None, None] + 1e-12
+        c = _smallest_eigenvector_2x2((M / scale)[:, picks].sum(axis=2))  # (d, subsets, 2)
+        lam = -np.einsum("dnk,dsk->dsn", AB, c) / AA[:, None]
+        sign = np.where(np.median(np.sign(lam), axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        c, lam = c * sign, lam * sign
+        err2 = np.einsum("dsk,dnkl,dsl->dsn", c, M, c) / np.maximum(seen[:, 1:].sum(1), 1)
+        err2 = err2 / np.maximum(lam, 1e-3) ** 2
+        good = np.clip(1 - err2 / tol**2, 0, None) * (lam > 0) * (motion2 > tol**2)
+        score = np.einsum("dsn,n->ds", good, weight)
+        best = np.argsort(-score, axis=None)[: 4 * keep]
+        for flat in best:
+            d, s = np.unravel_index(flat, score.shape)
+            found.append((float(score[d, s]), dirs[d], basis[d] @ c[d, s], float(theta)))
+    found.sort(key=lambda f: -f[0])
+    out: list[Hypothesis] = []
+    for score, a, c, theta in found:
+        if any(abs(h.axis @ a) > 0.98 and abs(h.point @ c) > 0.97 and np.sign(h.q.sum()) == np.sign((theta * profile).sum()) for h in out):
+            continue
+        out.append(Hypothesis("revolute", a, c, frames, theta * profile, score))
+        if len(out) >= keep:
+            break
+    return out
+
+
+def prismatic_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarray, weight: np.ndarray, tol: float,
+                         rng: np.random.Generator, directions: int = 600, keep: int = 3) -> list[Hypothesis]:
+    """Slide directions from one window; arguments as for :func:`revolute_hypotheses`.
+
+    With a common slide s_t d, |d| = 1, every track's depth follows linearly; depths are relative to the stroke.
+    """
+    n, m, _ = rays.shape
+    seen = np.isfinite(rays[..., 0])
+    x = np.where(seen[..., None], rays, 0.0)
+    dirs = np.concatenate([hemisphere(directions // 2), -hemisphere(directions // 2)])
+    A = np.cross(x[:, 1:], np.broadcast_to(x[:, :1], x[:, 1:].shape))
+    B = np.cross(x[None, :, 1:], dirs[:, None, None]) * profile[None, None, 1:, None]
+    AA = np.einsum("nmi,nmi->n", A, A) + 1e-12
+    lam = -np.einsum("nmi,dnmi->dn", A, B) / AA
+    r = np.einsum("nmi,dn->dnmi", A, lam) + B
+    err2 = np.einsum("dnmi,dnmi->dn", r, r) / np.maximum(seen[:, 1:].sum(1), 1) / np.maximum(lam, 1e-3) ** 2
+    motion2 = np.nanmax(np.sum((rays - rays[:, :1]) ** 2, axis=-1), axis=1)
+    score = (np.clip(1 - err2 / tol**2, 0, None) * (lam > 0) * (motion2 > tol**2)) @ weight
+    out: list[Hypothesis] = []
+    for d in np.argsort(-score):
+        if any(h.axis @ dirs[d] > 0.97 for h in out):
+            continue
+        depth = np.median(lam[d][lam[d] > 0]) if (lam[d] > 0).any() else 1.0
+        out.append(Hypothesis("prismatic", dirs[d], None, frames, profile / depth, float(score[d])))
+        if len(out) >= keep:
+            break
+    return out

@@ -1,0 +1,202 @@
+"""Windows, extension of a window's hypothesis to the whole video, and scoring on all tracks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
+from reconstruct.joint.hypotheses import Hypothesis, prismatic_hypotheses, revolute_hypotheses
+
+SCORE_PX = 3.0
+"""Scale of the robust score, working px."""
+
+
+def key_frames(uv: np.ndarray, count: int = 28) -> np.ndarray:
+    """(K,) frames spread evenly over the accumulated motion of moving tracks (N, T, 2), ends included."""
+    T = uv.shape[1]
+    step = np.linalg.norm(np.diff(uv, axis=1), axis=-1)
+    seen = np.isfinite(step)
+    speed = np.array([np.quantile(step[seen[:, t], t], 0.6) if seen[:, t].sum() > 3 else 0.0 for t in range(T - 1)])
+    total = np.concatenate([[0], np.cumsum(speed + 0.03 * speed.max() + 1e-9)])
+    return np.unique(np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, T - 1))
+
+
+def observations(uv_work: np.ndarray, focal_work: float, centre: np.ndarray, frames: np.ndarray, limit: int,
+                 rng: np.random.Generator, diagonal: float) -> tuple[Observations, np.ndarray]:
+    """Key-frame observations of moving tracks, thinned so that no textured spot dominates.
+
+    Returns:
+        observations, and (N,) indices into uv_work of the tracks kept.
+    """
+    uv = uv_work[:, frames]
+    seen = np.isfinite(uv[..., 0])
+    enough = seen.sum(1) >= 4
+    ids = np.flatnonzero(enough)
+    uv, seen = uv[ids], seen[ids]
+    middle = np.array([np.flatnonzero(s)[s.sum() // 2] for s in seen])
+    place = uv[np.arange(len(ids)), middle]
+    # Weight by the reciprocal of the number of neighbours in time and place: area counts, not texture.
+    near = (np.linalg.norm(place[:, None] - place[None], axis=-1) < 0.02 * diagonal) & (np.abs(middle[:, None] - middle[None]) <= 3)
+    weight = 1.0 / np.sqrt(near.sum(1))
+    motion = np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1)
+    weight *= np.clip(np.linalg.norm(motion, axis=1) / (0.06 * diagonal), 0.1, 1.0)
+    if len(ids) > limit:
+        pick = np.sort(rng.choice(len(ids), limit, replace=False, p=weight / weight.sum()))
+        ids, uv, seen, middle, weight = ids[pick], uv[pick], seen[pick], middle[pick], weight[pick]
+    xy = np.where(seen[..., None], (uv - centre) / focal_work, 0.0)
+    return Observations(xy, seen, middle, weight, 1.0 / focal_work, frames), ids
+
+
+def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int = 10) -> list[Hypothesis]:
+    """Hypotheses from windows around several reference key frames, both directions of time."""
+    K = len(obs.frames)
+    found: list[Hypothesis] = []
+    for ref in np.unique(np.linspace(0, K - 1, windows).round().astype(int)):
+        for span in (np.arange(ref, K), np.arange(ref, -1, -1)):
+            for length in {min(len(span), K // 3), len(span)}:
+                keys = span[:length]
+                if length < 5:
+                    continue
+                found += _one_window(obs, keys, rng)
+    return found
+
+
+def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator) -> list[Hypothesis]:
+    at_ref = obs.seen[:, keys[0]]
+    # Tracks seen at the reference and in most of the window; the window ends where too few are left.
+    for end in range(len(keys), 4, -3):
+        k = keys[:end]
+        long = at_ref & (obs.seen[:, k].mean(1) > 0.8) & obs.seen[:, k[-1]]
+        if long.sum() >= 8:
+            break
+    else:
+        return []
+    ids = np.flatnonzero(long)
+    if len(ids) > 70:
+        ids = np.sort(rng.choice(ids, 70, replace=False, p=obs.weight[ids] / obs.weight[ids].sum()))
+    if len(k) > 9:
+        k = k[np.unique(np.linspace(0, len(k) - 1, 9).round().astype(int))]
+    rays = np.concatenate([obs.xy[ids][:, k], np.ones((len(ids), len(k), 1))], axis=-1)
+    rays[~obs.seen[ids][:, k]] = np.nan
+    moved = np.linalg.norm(rays[..., :2] - rays[:, :1, :2], axis=-1)
+    top = np.nanmax(moved, axis=1)
+    strong = top > np.median(top)
+    profile = np.nan_to_num(np.nanmedian(moved[strong], axis=0))
+    if profile.max() < 6 * obs.px:
+        return []
+    profile = profile / profile.max()
+    tol = 3.0 * obs.px
+    w = obs.weight[ids]
+    return revolute_hypotheses(rays, k, profile, w, tol, rng) + prismatic_hypotheses(rays, k, profile, w, tol, rng)
+
+
+def extend(h: Hypothesis, obs: Observations) -> State:
+    """Carry a window's states to all key frames, one frame after the other (incremental structure from motion)."""
+    K = len(obs.frames)
+    known = np.zeros(K, bool)
+    known[h.frames] = True
+    order = np.argsort(h.frames)
+    q = np.interp(np.arange(K), h.frames[order], h.q[order])
+    lo, hi = h.frames.min(), h.frames.max()
+    known[lo : hi + 1] = True
+    span = max(np.ptp(h.q), 1e-3)
+    point = np.zeros(3) if h.point is None else h.point
+    s = State(h.kind, h.axis, point, q, np.ones(len(obs.ref)))
+    while True:
+        now = _restricted(obs, known)
+        s = solve_depths(s, now, sweeps=1)
+        if known.all():
+            break
+        X, _ = transport(s, now)
+        r2 = np.sum(reprojection(X, now) ** 2, axis=-1)
+        count = now.seen.sum(1)
+        good = (count >= 3) & (r2.sum(1) / np.maximum(count, 1) < (2 * SCORE_PX) ** 2)
+        for t, neighbour in ((lo - 1, lo), (lo - 2, lo), (hi + 1, hi), (hi + 2, hi)):
+            if not 0 <= t < K:
+                continue
+            use = good & obs.seen[:, t]
+            s.q[t] = _search_state(s, now, obs, use, t, s.q[neighbour], span)
+            known[t] = True
+        lo, hi = max(lo - 2, 0), min(hi + 2, K - 1)
+    # Depths so far belong to the first known key frame of each track; solve them on the tracks' own references.
+    return solve_depths(s, obs, sweeps=2)
+
+
+def _restricted(obs: Observations, known: np.ndarray) -> Observations:
+    seen = obs.seen & known
+    first = np.where(seen.any(1), seen.argmax(1), obs.ref)
+    return replace(obs, seen=seen, ref=first)
+
+
+def _search_state(s: State, now: Observations, obs: Observations, use: np.ndarray, t: int, start: float, span: float) -> float:
+    """The state in key frame t by a one-dimensional search over tracks whose depth is known."""
+    if use.sum() < 3:
+        return float(start)
+    sub = np.flatnonzero(use)
+    grid = start + span * np.linspace(-0.5, 0.5, 31)
+    rays = now.ref_rays[sub]
+    # One pseudo observation per track and candidate: reuse transport by writing the candidates as key frames.
+    cand = Observations(
+        np.broadcast_to(obs.xy[sub, t][:, None], (len(sub), 31 + len(s.q), 2)).copy(),
+        np.concatenate([np.zeros((len(sub), len(s.q)), bool), np.ones((len(sub), 31), bool)], axis=1),
+        now.ref[sub], obs.weight[sub], obs.px, np.arange(31 + len(s.q)),
+    )
+    cand.xy[np.arange(len(sub)), now.ref[sub]] = rays[:, :2]
+    trial = replace(s, q=np.concatenate([s.q, grid]), depth=s.depth[sub])
+    X, _ = transport(trial, cand)
+    r2 = np.sum(reprojection(X, cand)[:, len(s.q) :] ** 2, axis=-1)
+    cost = np.sum(obs.weight[sub][:, None] * np.minimum(r2, (3 * SCORE_PX) ** 2), axis=0)
+    k = int(np.argmin(cost))
+    if 0 < k < 30:                                            # parabola through the minimum
+        a, b, c = cost[k - 1 : k + 2]
+        shift = 0.5 * (a - c) / (a - 2 * b + c + 1e-12)
+        return float(grid[k] + np.clip(shift, -1, 1) * (grid[1] - grid[0]))
+    return float(grid[k])
+
+
+def explained(s: State, obs: Observations, scale: float = SCORE_PX) -> tuple[float, np.ndarray]:
+    """Explained motion: how much better than "static" the joint explains all tracks.
+
+    Each observation contributes rho(displacement) - rho(residual) with rho truncated, so a point that
+    hardly moves can contribute hardly anything, and one that is not explained nothing.
+
+    Returns:
+        (sum over tracks, (N,) mean contribution of each track in [−1, 1]).
+    """
+    X, _ = transport(s, obs)
+    r2 = np.sum(reprojection(X, obs) ** 2, axis=-1)
+    own = obs.xy[np.arange(len(obs.ref)), obs.ref][:, None]
+    moved2 = np.where(obs.seen, np.sum(((obs.xy - own) / obs.px) ** 2, axis=-1), 0)
+    rho = lambda e2: 1 - 1 / (1 + e2 / scale**2)  # noqa: E731
+    gain = np.where(obs.seen, rho(moved2) - rho(r2), 0)
+    per = gain.sum(1) / np.maximum(obs.seen.sum(1) - 1, 1)
+    sane = (s.depth > 0.1 * np.median(s.depth)) & (s.depth < 10 * np.median(s.depth))
+    per = np.where(sane, per, 0)
+    return float(np.sum(obs.weight * np.clip(per, 0, None) * np.sqrt(obs.seen.sum(1)))), per
+
+
+def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: int = 10) -> list[State]:
+    """Best joints of both types, best first."""
+    hyps = window_hypotheses(obs, rng)
+    out: list[State] = []
+    for kind in ("revolute", "prismatic"):
+        pool = sorted((h for h in hyps if h.kind == kind), key=lambda h: -h.score)[:coarse]
+        states = [extend(h, obs) for h in pool]
+        states.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
+        fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in _distinct(states, fine)]
+        fined.sort(key=lambda s: -explained(s, obs)[0])
+        out += [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
+    return sorted(out, key=lambda s: -explained(s, obs)[0])
+
+
+def _distinct(states: list[State], count: int) -> list[State]:
+    out: list[State] = []
+    for s in states:
+        same = lambda o: abs(o.axis @ s.axis) > 0.995 and (s.kind == "prismatic" or o.point @ s.point > 0.995)  # noqa: E731
+        if not any(same(o) for o in out):
+            out.append(s)
+        if len(out) >= count:
+            break
+    return out

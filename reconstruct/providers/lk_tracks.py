@@ -1,0 +1,169 @@
+"""Point tracks by pyramidal Lucas-Kanade from many reference frames, in both directions of time.
+
+One reference frame is a lottery: a closed door may have no texture where the open one has a rack of
+corners. Corners are therefore seeded in every reference frame, wherever the picture ever changes, and
+followed forwards and backwards through the whole video. Every step is checked by tracking back, and
+each point is re-registered against the last frame in which it was well anchored, so that errors do
+not pile up frame by frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from reconstruct.cues import Hands, ProviderInfo, Tracks
+from reconstruct.video import Video
+
+WINDOW = 15
+FB_PX = 0.7
+"""Forward-backward distance above which a step counts as lost, working px."""
+ANCHOR_PX = 2.0
+"""How far re-registration against the anchor may move a point before the anchor counts as outdated, working px."""
+CHANGE_GREY = 18.0
+
+
+def reference_frames(video: Video, count: int = 16) -> np.ndarray:
+    """(R,) working frames, spread evenly over accumulated picture change (first and last included)."""
+    import cv2
+
+    small = [cv2.resize(f, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.int16) for f in video.frames]
+    change = np.zeros(len(video))
+    for t in range(1, len(video)):
+        d = np.abs(small[t] - small[t - 1]).max(axis=-1)
+        change[t] = np.mean(np.clip(d - 8, 0, 24))
+    total = np.cumsum(change + 0.05 * change.mean() + 1e-6)
+    wanted = np.linspace(total[0], total[-1], count)
+    return np.unique(np.searchsorted(total, wanted).clip(0, len(video) - 1))
+
+
+def change_region(video: Video, dilate: int = 9) -> np.ndarray:
+    """(h, w) bool, pixels whose smoothed brightness ever differs clearly from another time's."""
+    import cv2
+
+    step = max(1, len(video) // 80)
+    low = high = None
+    for f in video.frames[::step]:
+        g = cv2.GaussianBlur(cv2.cvtColor(f, cv2.COLOR_BGR2GRAY), (0, 0), 1.5)
+        low = g if low is None else np.minimum(low, g)
+        high = g if high is None else np.maximum(high, g)
+    region = (high.astype(np.int16) - low) > CHANGE_GREY
+    region = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return cv2.dilate(region, np.ones((2 * dilate + 1,) * 2, np.uint8)) > 0
+
+
+def track_points(video: Video, hands: Hands | None = None, references: np.ndarray | None = None,
+                 per_reference: int = 220, progress: Callable[[float], None] | None = None) -> Tracks:
+    """Seed and follow corners.
+
+    Args:
+        video: stabilised video.
+        hands: pixels under hands are neither seeded nor followed.
+        references: (R,) frames in which to seed; chosen from the picture change when None.
+        per_reference: at most this many seeds a reference frame.
+        progress: called with the done share in [0, 1].
+
+    Returns:
+        Tracks in full px; points that are lost or under a hand are not visible.
+    """
+    import cv2
+
+    references = reference_frames(video) if references is None else np.asarray(references)
+    region = change_region(video)
+    covered = None
+    if hands is not None and hands.mask is not None:
+        k = np.ones((11, 11), np.uint8)
+        covered = np.stack([cv2.dilate(m.astype(np.uint8), k) for m in hands.mask]) > 0
+    grey = [cv2.cvtColor(f, cv2.COLOR_BGR2GRAY) for f in video.frames]
+    seeds, frames = [], []
+    for r in references:
+        mask = region if covered is None else region & ~covered[r]
+        p = _corners(grey[r], mask, per_reference)
+        seeds.append(p)
+        frames.append(np.full(len(p), r))
+    start = np.concatenate(seeds) if seeds else np.zeros((0, 2), np.float32)
+    reference = np.concatenate(frames).astype(int) if frames else np.zeros(0, int)
+    T = len(video)
+    uv = np.full((len(start), T, 2), np.nan, np.float32)
+    uv[np.arange(len(start)), reference] = start
+    done = 0
+    for order in (range(T), range(T - 1, -1, -1)):
+        _follow(grey, list(order), uv, reference, covered)
+        done += 1
+        if progress:
+            progress(done / 2)
+    visible = np.isfinite(uv[..., 0])
+    return Tracks(video.to_full(uv).astype(np.float32), visible, reference, ProviderInfo("lk", cv2.__version__, "Apache-2.0"))
+
+
+def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
+    """(N, 2) float32 corners: strongest first with spacing, weak ones allowed down to the noise level."""
+    import cv2
+
+    strength = cv2.cornerMinEigenVal(grey, 7)
+    strength[~mask] = 0
+    noise = np.median(cv2.cornerMinEigenVal(cv2.GaussianBlur(grey, (0, 0), 3), 7)) + 1e-7
+    local = strength == cv2.dilate(strength, np.ones((9, 9), np.uint8))
+    y, x = np.nonzero(local & (strength > max(8e-6, 4 * noise)))
+    order = np.argsort(-strength[y, x])[: 4 * count]
+    y, x = y[order], x[order]
+    # Half of the seeds go to the strongest corners, half are spread over cells so that weak surfaces get some.
+    cell = (y // 48) * 1000 + x // 48
+    rank = np.zeros(len(y), int)
+    seen: dict[int, int] = {}
+    for i, c in enumerate(cell):
+        rank[i] = seen.get(c, 0)
+        seen[c] = rank[i] + 1
+    pick = np.argsort(rank, kind="stable")[:count]
+    p = np.stack([x[pick], y[pick]], axis=-1).astype(np.float32)
+    if len(p):
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.02)
+        p = cv2.cornerSubPix(grey, p.reshape(-1, 1, 2).copy(), (4, 4), (-1, -1), criteria).reshape(-1, 2)
+    return p
+
+
+def _follow(grey: list[np.ndarray], order: list[int], uv: np.ndarray, reference: np.ndarray,
+            covered: np.ndarray | None) -> None:
+    """Extend all tracks along `order` (in place); each starts when its reference frame comes up."""
+    import cv2
+
+    h, w = grey[0].shape
+    lk = dict(winSize=(WINDOW, WINDOW), maxLevel=3)
+    flags = dict(flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    alive = np.zeros(len(uv), bool)
+    anchor = reference.copy()
+    velocity = np.zeros((len(uv), 2), np.float32)
+    for s, t in zip(order[:-1], order[1:], strict=True):
+        alive |= reference == s
+        ids = np.flatnonzero(alive)
+        if not len(ids):
+            continue
+        p = uv[ids, s].reshape(-1, 1, 2)
+        n, ok, _ = cv2.calcOpticalFlowPyrLK(grey[s], grey[t], p, p + velocity[ids, None], **flags, **lk)
+        b, ok2, _ = cv2.calcOpticalFlowPyrLK(grey[t], grey[s], n, p.copy(), **flags, **lk)
+        good = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(b - p, axis=-1).ravel() < FB_PX)
+        n = n.reshape(-1, 2)
+        x, y = n[:, 0], n[:, 1]
+        good &= (x > 4) & (y > 4) & (x < w - 5) & (y < h - 5)
+        if covered is not None:
+            inside = good.copy()
+            inside[good] = covered[t][y[good].round().astype(int), x[good].round().astype(int)]
+            good &= ~inside
+        alive[ids[~good]] = False
+        ids, n = ids[good], n[good]
+        # Re-register against each point's anchor frame; group by anchor to share pyramids.
+        for a in np.unique(anchor[ids]):
+            if a == s:
+                continue
+            sel = np.flatnonzero(anchor[ids] == a)
+            pa = uv[ids[sel], a].reshape(-1, 1, 2)
+            m, ok, _ = cv2.calcOpticalFlowPyrLK(grey[a], grey[t], pa, n[sel].reshape(-1, 1, 2).copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags)
+            c, ok2, _ = cv2.calcOpticalFlowPyrLK(grey[t], grey[a], m, pa.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags)
+            m = m.reshape(-1, 2)
+            fine = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(c - pa, axis=-1).ravel() < 0.5)
+            fine &= np.linalg.norm(m - n[sel], axis=-1) < ANCHOR_PX
+            n[sel[fine]] = m[fine]
+            anchor[ids[sel[~fine]]] = s  # the last frame in which the anchor still held
+        velocity[ids] = n - uv[ids, s]
+        uv[ids, t] = n
