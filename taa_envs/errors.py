@@ -1,0 +1,21 @@
+"""Errors a user of the package can meet; each message says what is wrong and what to do."""
+
+
+class TaaEnvsError(Exception):
+    """Base of the errors that the package raises on purpose."""
+
+
+class AssetError(TaaEnvsError):
+    """An asset folder, or what was to become one, is not valid."""
+
+
+class AssetExists(AssetError):
+    """There is an asset of that id already."""
+
+
+class UnknownAsset(TaaEnvsError, LookupError):
+    """No asset has that id; the message lists the ids there are."""
+
+
+class UnknownHand(TaaEnvsError, LookupError):
+    """No hand has that name; the message lists the names there are."""

@@ -1,0 +1,241 @@
+"""Open-loop replay: the demonstrated hand, on its actuators, against the passive joint; and its negative controls.
+
+The hand's targets follow the reference; nobody looks at the object and nobody writes its state. Scores are those of the
+contract, at the end of the replay:
+
+``joint_progress``      clip((q - q_start) / (q_demo_end - q_start), 0, 1)
+``final_q_error``       |q - q_demo_end| / (max q_demo - min q_demo)
+``max_progress``        the largest progress on the way
+``contact_fraction``    of the reference's ``contact`` frames up to the demonstration's end, the fraction during which
+                        (from that frame to the next) the hand pushed on the moving link; 0 where the reference has none
+``max_penetration_m``   deepest overlap of hand and moving link
+``wrong_way``           largest motion against the demonstration's direction, as a fraction of its stroke
+``controls``            ``joint_progress`` of three replays that must not succeed:
+
+- *no_hand*: the same time without a hand. Finds objects that move by themselves.
+- *mirrored_hand*: the hand reflected, at every time, in the fixed plane in which the link lies when the demonstration
+  starts: through the axis and the link's centre of mass (revolute; through the hand instead of the centre of mass where
+  that lies on the axis), or square to the axis through the centre of mass (prismatic). Reflection turns the
+  demonstrated motion about: the hand is as near to the link, on its other side, and moves the wrong way. Finds joints
+  that answer to a hand's presence rather than to its push.
+- *late_hand*: the whole hand motion delayed by the time from the onset of the demonstrated stroke (2 % progress) to the
+  replay's end, so that the hand is about to begin when time is up. Finds joints that move by the clock, and starts
+  whose overlap of hand and link alone pushes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taa_envs.asset import Asset
+from taa_envs.scene import Scene, build_scene
+from taa_envs.simulation import Diverged, HandPath, Simulation, Step
+
+CONTROLS = ("no_hand", "mirrored_hand", "late_hand")
+HOLD = 0.2  # s for which the hand stays at its last pose: time for what it pushes to catch up
+ONSET = 0.02  # progress at which the demonstrated stroke has begun
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One replay, sampled at the reference's frames up to the demonstration's end and once more after the hold.
+
+    Attributes:
+        time: (N,) s of the reference.  q: (N,) simulated.  q_demo: (N,) demonstrated.
+        contact: (N,) bool, whether the hand pushed on the link between this frame and the next.
+        penetration: (N,) m, deepest in that time.
+        qpos: (N, nq) full state, for rendering.
+        joints: (N, 21, 3) m, where the hand's targets were.
+        driven: change of q made while contact did work, rad or m.
+    """
+
+    time: np.ndarray
+    q: np.ndarray
+    q_demo: np.ndarray
+    contact: np.ndarray
+    penetration: np.ndarray
+    qpos: np.ndarray
+    joints: np.ndarray
+    driven: float
+    q_extremes: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """Scores of a replay, the fields of the contract; trajectory and notes beside them."""
+
+    joint_progress: float
+    final_q_error: float
+    max_progress: float
+    contact_fraction: float
+    max_penetration_m: float
+    wrong_way: float
+    controls: dict[str, float]
+    trajectory: Trajectory = field(repr=False)
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict:
+        """The contract's object, JSON-ready."""
+        return {"joint_progress": self.joint_progress, "final_q_error": self.final_q_error,
+                "max_progress": self.max_progress, "contact_fraction": self.contact_fraction,
+                "max_penetration_m": self.max_penetration_m, "wrong_way": self.wrong_way,
+                "controls": dict(self.controls)}
+
+
+def mirror_plane(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Point (3,) m and unit normal (3,) of the plane in which the mirrored control reflects the hand."""
+    import mujoco
+
+    asset = scene.asset
+    data = mujoco.MjData(scene.model)
+    data.qpos[scene.qpos] = asset.demo["q_start"]
+    mujoco.mj_kinematics(scene.model, data)
+    mujoco.mj_comPos(scene.model, data)
+    centre = data.xipos[scene.model.body("moving").id].copy()
+    axis = np.array(asset.joint["axis"], float)
+    axis /= np.linalg.norm(axis)
+    if asset.joint_type == "prismatic":
+        return centre, axis
+    point = np.array(asset.joint["point"], float)
+
+    def from_axis(x: np.ndarray) -> np.ndarray:
+        return (x - point) - ((x - point) @ axis) * axis
+
+    arm = from_axis(centre)
+    if np.linalg.norm(arm) < 0.05 * scene.size:  # a knob: its centre of mass names no side
+        reference = asset.reference
+        first = int(np.argmax(reference.contact)) if reference.contact.any() else 0
+        arm = from_axis(reference.hand_joints[first].mean(0))
+    normal = np.cross(axis, arm)
+    length = np.linalg.norm(normal)
+    if length < 1e-9:
+        normal, length = np.linalg.svd(axis[None])[2][1], 1.0
+    return point, normal / length
+
+
+def control_path(scene: Scene, name: str) -> HandPath | None:
+    """The hand of a control ("no_hand", "mirrored_hand", "late_hand"), see the module's text; None for no hand."""
+    asset, reference = scene.asset, scene.asset.reference
+    if name == "no_hand":
+        return None
+    if name == "mirrored_hand":
+        point, normal = mirror_plane(scene)
+        away = (reference.hand_joints - point) @ normal
+        return HandPath(reference.time, reference.hand_joints - 2 * away[..., None] * normal)
+    if name == "late_hand":
+        onset = int(np.argmax(asset.stroke_fraction(reference.q) >= ONSET))
+        delay = asset.end_time + HOLD - reference.time[max(onset - 1, 0)]
+        return HandPath(reference.time + delay, reference.hand_joints)
+    raise ValueError(f"no control is named {name!r}; known: {', '.join(CONTROLS)}")
+
+
+def simulate(scene: Scene, path: HandPath | None) -> Trajectory:
+    """Run the hand along path from the reference's first frame to the demonstration's end plus :data:`HOLD`.
+
+    Raises:
+        Diverged: the simulation became unstable.
+    """
+    asset, reference = scene.asset, scene.asset.reference
+    end = asset.demo["demo_end_frame"]
+    start = float(reference.time[0])
+    stop = asset.end_time + HOLD
+    sim = Simulation(scene)
+    lead = scene.hand.lead if scene.hand is not None else 0.0
+    sim.reset(asset.demo["q_start"], path.at(start) if path is not None else np.zeros((21, 3)))
+    steps = int(np.ceil((stop - start) / scene.model.opt.timestep))
+    edges = np.append(reference.time[:end + 1], stop)
+    rows: list[tuple] = []
+    window, driven, frame = Step(), 0.0, 0
+    least = most = sim.q
+
+    def sample(t: float, k: int) -> tuple:
+        joints = path.at(t) if path is not None else np.full((21, 3), np.nan)
+        return t, sim.q, reference.q[min(k, end)], sim.data.qpos.copy(), joints
+
+    opened = sample(start, 0)
+    for i in range(steps):
+        t = start + i * scene.model.opt.timestep
+        while t >= edges[frame + 1] and frame < end:
+            rows.append((*opened, window.contact, window.penetration))
+            frame += 1
+            window, opened = Step(), sample(t, frame)
+        window.add(step := sim.step(path.at(t + lead) if path is not None else None))
+        driven += step.driven
+        least, most = min(least, sim.q), max(most, sim.q)
+    rows.append((*opened, window.contact, window.penetration))
+    rows.append((*sample(stop, end), step.contact, step.penetration))
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    return Trajectory(time=columns[0], q=columns[1], q_demo=columns[2], qpos=columns[3], joints=columns[4],
+                      contact=columns[5], penetration=columns[6], driven=driven, q_extremes=(least, most))
+
+
+def replay(asset: Asset, hand: str | object = "points", *, controls: bool = True, touch_static: bool = False
+           ) -> ReplayResult:
+    """Replay the demonstration and its controls through contact.
+
+    Args:
+        asset: as loaded.
+        hand: name of a hand, or a hand.
+        controls: whether to run the three controls too (three more replays); their dict is empty otherwise.
+        touch_static: see :mod:`taa_envs.scene`.
+
+    Raises:
+        AssetError, UnknownHand: the scene cannot be built.
+        Diverged: the simulation became unstable.
+    """
+    reference = asset.reference
+    scene = build_scene(asset, hand, touch_static=touch_static)
+    run = simulate(scene, HandPath(reference.time, reference.hand_joints))
+    notes = []
+    end = asset.demo["demo_end_frame"]
+    if end < len(reference.time) - 1:
+        notes.append(f"the demonstration comes back; replayed and scored up to frame {end}, the end of its main stroke")
+    wanted = reference.contact[:end + 1]
+    if not wanted.any():
+        notes.append("the reference marks no frame as driven by the hand; contact_fraction is 0 for want of any")
+    progress = {}
+    for name in CONTROLS if controls else ():
+        control_scene = build_scene(asset, None) if name == "no_hand" else scene
+        progress[name] = float(asset.progress(simulate(control_scene, control_path(scene, name)).q[-1]))
+    fractions = asset.stroke_fraction(np.array(run.q_extremes))
+    return ReplayResult(
+        joint_progress=float(asset.progress(run.q[-1])), final_q_error=asset.final_q_error(run.q[-1]),
+        max_progress=float(np.clip(fractions.max(), 0, 1)),
+        contact_fraction=float(run.contact[:end + 1][wanted].mean()) if wanted.any() else 0.0,
+        max_penetration_m=float(run.penetration.max()), wrong_way=float(max(0.0, -fractions.min())),
+        controls=progress, trajectory=run, notes=tuple(notes))
+
+
+def render_frames(asset: Asset, trajectory: Trajectory, *, hand: str | object | None = "points",
+                  camera: str | None = None, width: int | None = None, height: int = 480) -> Iterator[np.ndarray]:
+    """Pictures of a replay, one a sample of its trajectory, so that frame i goes beside the video's frame i.
+
+    Args:
+        camera: "video", "overview" or None for video where the asset has one.
+        width: px; default keeps the camera's aspect (4:3 for the overview).
+
+    Yields:
+        (height, width, 3) uint8 RGB. Width and height are made even, as video encoders want them.
+    """
+    import mujoco
+
+    scene = build_scene(asset, hand)
+    if camera is None:
+        camera = "video" if asset.camera is not None else "overview"
+    aspect = asset.camera["width"] / asset.camera["height"] if camera == "video" and asset.camera else 4 / 3
+    width = int(round(height * aspect)) if width is None else width
+    width, height = width + width % 2, height + height % 2
+    data = mujoco.MjData(scene.model)
+    with mujoco.Renderer(scene.model, height=height, width=width) as renderer:
+        for qpos in trajectory.qpos:
+            data.qpos[:] = qpos
+            mujoco.mj_forward(scene.model, data)
+            renderer.update_scene(data, camera=camera)
+            yield renderer.render().copy()
+
+
+__all__ = ["CONTROLS", "Diverged", "ReplayResult", "Trajectory", "control_path", "mirror_plane", "render_frames",
+           "replay", "simulate"]

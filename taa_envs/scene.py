@@ -1,0 +1,205 @@
+"""Scenes: asset + hand + floor + lights + cameras, compiled. The only place that builds one.
+
+Who touches whom: the hand touches the moving link and nothing else. Not itself (its spheres are free of each other),
+not the floor, and by default not the static link: much of a static link is assumed (nobody saw its back), a monocular
+hand is off by centimetres, and a hand that catches on a surface nobody saw would fail for a reason that is not in the
+video. ``touch_static=True`` lets it touch. The links do not touch each other: the joint's range is the stop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taa_envs.asset import Asset
+from taa_envs.errors import AssetError
+from taa_envs.hands import make_hand
+
+TIMESTEP = 0.002  # s
+MOVING_BIT, STATIC_BIT = 1 << 1, 1 << 2
+FLOOR_GAP = 0.01  # m between the lowest point of either link and the floor
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene and where things are in it.
+
+    Attributes:
+        asset: what it shows.  model: ``mujoco.MjModel``.
+        hand: controller bound to the model, None in a scene without a hand.
+        qpos, dof: addresses of the object's joint.
+        hand_geoms, moving_geoms: (ngeom,) bool.
+        surface: (P, 3) points of the moving link's collision surface in its own frame, m.
+        centre: (3,) and size: m, of the bounding box of both links at q = 0.
+    """
+
+    asset: Asset
+    model: object
+    hand: object | None
+    qpos: int
+    dof: int
+    hand_geoms: np.ndarray
+    moving_geoms: np.ndarray
+    surface: np.ndarray
+    centre: np.ndarray
+    size: float
+
+
+def _mesh_points(model: object, data: object, geom: int) -> np.ndarray:
+    mesh = int(model.geom_dataid[geom])
+    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    points = model.mesh_vert[start:start + count].astype(float)
+    return points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+
+
+def _bounds(model: object) -> tuple[np.ndarray, np.ndarray]:
+    """(2, 3) box at q = 0, and (2, 3) box over the joint's range, of all mesh geoms."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    boxes = []
+    for q in (0.0, *np.linspace(*model.jnt_range[0], 7)):
+        data.qpos[0] = q
+        mujoco.mj_kinematics(model, data)
+        points = np.concatenate([_mesh_points(model, data, g) for g in range(model.ngeom) if model.geom_dataid[g] >= 0])
+        boxes.append([points.min(0), points.max(0)])
+    boxes = np.array(boxes)
+    return boxes[0], np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
+    """(3, 3) rotation of a MuJoCo camera (right, up, backward as columns) at position that looks at target."""
+    back = np.asarray(position, float) - target
+    back /= np.linalg.norm(back)
+    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
+    if abs(back @ up) > 0.99:
+        up = np.array([0.0, 1.0, 0.0])
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back], axis=1)
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    import mujoco
+
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, rotation.ravel())
+    return quat
+
+
+def _add_cameras(spec: object, asset: Asset, centre: np.ndarray, size: float) -> None:
+    import mujoco
+
+    view = np.array([1.0, -1.0, 0.7])
+    if asset.camera is not None:
+        camera = asset.camera
+        K, T = np.array(camera["K"], float), np.array(camera["T_camera_world"], float)
+        width, height = camera["width"], camera["height"]
+        position = -T[:3, :3].T @ T[:3, 3]
+        rotation = T[:3, :3].T @ np.diag([1.0, -1.0, -1.0])  # right, down, forward -> right, up, backward
+        # Pixel (0, 0) is the centre of a pixel, so the image's middle is ((w - 1) / 2, (h - 1) / 2).
+        spec.worldbody.add_camera(
+            name="video", pos=position, quat=_quaternion(rotation), resolution=[width, height],
+            sensor_size=[width * 1e-5, height * 1e-5], focal_pixel=[K[0, 0], K[1, 1]],
+            principal_pixel=[K[0, 2] - (width - 1) / 2, (height - 1) / 2 - K[1, 2]])
+        view = position - centre
+    view = view / np.linalg.norm(view)
+    position = centre + view * size * 1.9
+    spec.worldbody.add_camera(name="overview", pos=position, quat=_quaternion(look_at(position, centre)), fovy=45,
+                              proj=mujoco.mjtProjection.mjPROJ_PERSPECTIVE)
+
+
+def build_spec(asset: Asset, hand: object | None, *, touch_static: bool = False) -> object:
+    """The scene as an uncompiled ``mujoco.MjSpec``; hand as from :func:`taa_envs.hands.make_hand`, None for none.
+
+    Raises:
+        AssetError: the asset's model does not compile.
+    """
+    import mujoco
+
+    try:
+        spec = mujoco.MjSpec.from_file(str(asset.model_path))
+        spec.compiler.degree = False
+        box, swept = _bounds(spec.compile())
+    except ValueError as error:
+        raise AssetError(f"{asset.model_path} does not compile: {str(error)[:200]}") from None
+    centre, size = box.mean(0), float(np.linalg.norm(box[1] - box[0]))
+    spec.modelname = f"TAA/{asset.id}"
+    for name, bit in (("static", STATIC_BIT), ("moving", MOVING_BIT)):
+        for geom in spec.body(name).geoms:
+            if geom.contype or geom.conaffinity:
+                geom.contype, geom.conaffinity = bit, 0
+    option = spec.option
+    option.timestep = TIMESTEP
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 5.0  # stiffer friction than normal force: a pinch holds instead of creeping
+
+    lowest = swept[0, 2]
+    if asset.camera is not None:  # a floor above the video's camera would hide everything from it
+        T = np.array(asset.camera["T_camera_world"], float)
+        lowest = min(lowest, float((-T[:3, :3].T @ T[:3, 3])[2]) - 0.1 * size)
+    spec.add_texture(name="floor", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+                     rgb1=[0.82, 0.83, 0.84], rgb2=[0.76, 0.77, 0.79], width=256, height=256)
+    spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+                     rgb1=[0.93, 0.95, 0.97], rgb2=[0.75, 0.8, 0.86], width=128, height=128)
+    material = spec.add_material(name="floor", texrepeat=[4 / size, 4 / size], texuniform=True, specular=0.0)
+    textures = list(material.textures)
+    textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "floor"
+    material.textures = textures
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, size],
+                            pos=[centre[0], centre[1], lowest - FLOOR_GAP], material="floor", contype=0, conaffinity=0)
+    spec.worldbody.add_light(name="key", pos=centre + size * np.array([1.5, -2.0, 3.0]), dir=[-0.4, 0.55, -0.8],
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=True, diffuse=[0.55] * 3)
+    spec.worldbody.add_light(name="fill", pos=centre + size * np.array([-2.0, 1.0, 2.0]), dir=[0.7, -0.4, -0.6],
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False, diffuse=[0.25] * 3)
+    spec.visual.headlight.ambient = [0.35] * 3
+    spec.visual.headlight.diffuse = [0.25] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = 2560
+    spec.visual.map.znear = 0.005
+    spec.stat.center, spec.stat.extent = centre, size
+    _add_cameras(spec, asset, centre, size)
+    if hand is not None:
+        hand.attach(spec)
+        for geom in spec.geoms:
+            if geom.parent.name not in ("static", "moving", "world"):
+                geom.contype, geom.conaffinity = 0, MOVING_BIT | (STATIC_BIT if touch_static else 0)
+    return spec
+
+
+def build_scene(asset: Asset, hand: str | object | None = "points", *, touch_static: bool = False) -> Scene:
+    """Compile asset, hand, floor, lights and the cameras ``overview`` and (where it is known) ``video``.
+
+    Args:
+        asset: as loaded.
+        hand: a hand's name, a hand, or None for a scene without one.
+        touch_static: whether the hand can touch the static link, see the module's text.
+
+    Raises:
+        AssetError: the asset's model does not compile.
+        UnknownHand: no hand has that name.
+    """
+    import mujoco
+
+    made = make_hand(hand) if isinstance(hand, str) else hand
+    model = build_spec(asset, made, touch_static=touch_static).compile()
+    moving = model.geom_bodyid == model.body("moving").id
+    static = model.geom_bodyid == model.body("static").id
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    box, _ = _bounds_at_rest(model, data, moving | static)
+    surface = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(moving & touching)])
+    if len(surface) > 500:
+        surface = surface[np.linspace(0, len(surface) - 1, 500).astype(int)]
+    return Scene(asset=asset, model=model, hand=None if made is None else made.bind(model),
+                 qpos=int(model.joint("joint").qposadr[0]), dof=int(model.joint("joint").dofadr[0]),
+                 hand_geoms=touching & ~moving & ~static, moving_geoms=touching & moving, surface=surface,
+                 centre=box.mean(0), size=float(np.linalg.norm(box[1] - box[0])))
+
+
+def _bounds_at_rest(model: object, data: object, geoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    points = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(geoms)])
+    return np.stack([points.min(0), points.max(0)]), points

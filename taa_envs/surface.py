@@ -1,0 +1,125 @@
+"""Surfaces on disk: coloured meshes for the eye, convex parts for contact, and the inertia they stand for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from taa_envs.errors import AssetError
+
+MAX_FACES = 60_000
+COLOUR_STEP = 12  # grey levels within a face above which it is split, so that a coarse mesh keeps its picture
+MIN_EDGE_SHARE = 1 / 150  # of the mesh's size: smaller faces are never split
+SOLID_THICKNESS = 1e-5  # m; a collision part thinner than this is not a solid
+
+
+def _arrays(link: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    vertices, faces = np.asarray(link.vertices, float), np.asarray(link.faces)
+    colours = np.asarray(link.colors)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 3 or not np.isfinite(vertices).all():
+        raise AssetError(f"mesh vertices must be (V, 3) finite numbers, have shape {vertices.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+        raise AssetError(f"mesh faces must be (F, 3) indices of its {len(vertices)} vertices, have shape {faces.shape}")
+    if colours.shape[:1] != (len(vertices),) or colours.ndim != 2 or colours.shape[1] not in (3, 4):
+        raise AssetError(f"mesh colours must be (V, 3) or (V, 4), have shape {colours.shape}")
+    return vertices, faces.astype(np.int64), colours[:, :3].astype(float)
+
+
+def _refine(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split faces whose corners differ in colour until one colour a face will do."""
+    from trimesh.remesh import subdivide
+
+    smallest = MIN_EDGE_SHARE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    for _ in range(6):
+        corners = colours[faces]
+        edges = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
+        split = np.flatnonzero((np.ptp(corners, axis=1).max(axis=1) > COLOUR_STEP) & (edges > smallest))
+        if not len(split) or len(faces) + 3 * len(split) > MAX_FACES:
+            break
+        vertices, faces, attributes = subdivide(vertices, faces, face_index=split, vertex_attributes={"colour": colours})
+        colours = attributes["colour"]
+    return vertices, faces, colours
+
+
+def write_textured_obj(folder: Path, name: str, link: object) -> None:
+    """``name.obj`` and ``name.png``: MuJoCo has no vertex colours, so each face gets a texel of its own.
+
+    All three corners of a face name the centre of its texel: no seam, filter or mip level can mix faces.
+
+    Raises:
+        AssetError: the link's arrays do not fit each other.
+    """
+    from PIL import Image
+
+    vertices, faces, colours = _refine(*_arrays(link))
+    side = int(np.ceil(np.sqrt(len(faces))))
+    atlas = np.zeros((side * side, 3), np.uint8)
+    atlas[:len(faces)] = np.clip(np.rint(colours[faces].mean(axis=1)), 0, 255)
+    Image.fromarray(atlas.reshape(side, side, 3)).save(folder / f"{name}.png")
+    column, row = np.arange(len(faces)) % side, np.arange(len(faces)) // side
+    uv = np.stack([(column + 0.5) / side, 1 - (row + 0.5) / side], axis=1)
+    lines = [f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in vertices]
+    lines += [f"vt {u:.8f} {v:.8f}" for u, v in uv]
+    lines += [f"f {a}/{t} {b}/{t} {c}/{t}" for t, (a, b, c) in enumerate(faces + 1, start=1)]
+    (folder / f"{name}.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def write_convex_part(path: Path, part: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Write the hull of a convex part; False if it is flat, which MuJoCo cannot collide with.
+
+    Raises:
+        AssetError: its vertices are not (v, 3) finite numbers.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = np.asarray(part[0], float)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise AssetError(f"a collision part's vertices must be (v, 3) finite numbers, have shape {points.shape}")
+    if len(points) < 4 or np.linalg.svd(points - points.mean(0), compute_uv=False)[-1] < SOLID_THICKNESS:
+        return False
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return False
+    index = np.full(len(points), -1)
+    index[hull.vertices] = np.arange(len(hull.vertices))
+    triangles = index[hull.simplices]
+    corners = points[hull.simplices]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normal, hull.equations[:, :3]) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    lines = [f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in points[hull.vertices]]
+    lines += [f"f {a} {b} {c}" for a, b, c in triangles + 1]
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    return True
+
+
+def link_inertia(link: object, density: float, mass: float | None = None
+                 ) -> tuple[float, np.ndarray, np.ndarray, float, str]:
+    """Mass (kg), centre (3,) m, inertia about it (3, 3) kg m2, volume (m3), and a sentence on how.
+
+    From the closed surface where it encloses a volume, from the union of the convex parts' hulls otherwise.
+
+    Raises:
+        AssetError: neither encloses a volume.
+    """
+    import trimesh
+
+    vertices, faces, _ = _arrays(link)
+    surface = trimesh.Trimesh(vertices, faces, process=True)
+    how = "volume of the closed surface times density"
+    if not (surface.is_watertight and surface.volume > 0):
+        hulls = [trimesh.PointCloud(np.asarray(p[0], float)).convex_hull for p in link.parts if len(p[0]) >= 4]
+        if not hulls:
+            raise AssetError("the moving link's surface is open and it has no collision part; close it")
+        surface = trimesh.util.concatenate(hulls)
+        how = "volume of the convex parts times density (the surface is not closed)"
+    volume = float(surface.volume)
+    scale = (mass / volume) if mass is not None else density
+    tensor = np.asarray(surface.moment_inertia, float) * scale
+    # MuJoCo wants moments that obey the triangle inequality with room to spare; a flat sheet sits on its edge.
+    tensor = (tensor + tensor.T) / 2 + 1e-3 * np.trace(tensor) * np.eye(3)
+    if not (volume > 0 and np.linalg.eigvalsh(tensor)[0] > 0):
+        raise AssetError("the moving link encloses no volume; close its surface")
+    return volume * scale, np.asarray(surface.center_mass, float), tensor, volume, "mass given" if mass else how
