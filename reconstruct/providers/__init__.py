@@ -1,0 +1,1 @@
+"""Providers: who or what makes a cue (hands, tracks, masks, depth, meshes, cameras)."""
