@@ -1,0 +1,291 @@
+"""The ``taa`` command: parses, calls one function, prints.
+
+Exit codes: 0 done; 1 refused or failed, with one line ``error: what is wrong; what to do`` on stderr; 2 usage.
+With ``--json`` stdout carries one JSON object and nothing else; progress and words go to stderr.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Annotated, Literal
+
+import tyro
+
+from taa_envs import cli_commands as commands
+from taa_envs.cli_commands import Outcome
+
+
+@dataclass(kw_only=True)
+class Common:
+    json: bool = False
+    """One JSON object on stdout and nothing else there."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclass(kw_only=True)
+class Reconstruct(Common):
+    """Turn one video of a hand moving an articulated object into a registered asset."""
+
+    video: tyro.conf.Positional[Path]
+    """One unbroken shot; a static or gently hand-held camera."""
+    id: str
+    """Name of the asset: 1 to 64 of a-z 0-9 _ -."""
+    scene: Path | None = None
+    """Folder that keeps every cue, so that a second run resumes and a cue can be replaced by hand."""
+    out: Path | None = None
+    """Folder of assets to write into (default: the user's data folder)."""
+    focal: float | None = None
+    """Focal length of the upright full-size frame, px (default: metadata, else estimated with the joint)."""
+    segment: str | None = None
+    """Provider of the link masks."""
+    depth: str | None = None
+    """Provider of depth."""
+    track: str | None = None
+    """Provider of point tracks."""
+    hand: str | None = None
+    """Provider of hands."""
+    mesh: str | None = None
+    """Provider of link meshes."""
+    camera: str | None = None
+    """Provider of camera motion."""
+    overwrite: bool = False
+    """Replace an asset of this id."""
+    seed: int = 0
+    """Seed of everything that draws."""
+
+    def run(self) -> Outcome:
+        names = ("segment", "depth", "track", "hand", "mesh", "camera")
+        chosen = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return commands.reconstruct(self.video, self.id, self.scene, self.out, self.focal, chosen, self.overwrite,
+                                    self.seed)  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class Fit(Common):
+    """Fit the articulation alone, from the cues in a scene folder."""
+
+    scene: tyro.conf.Positional[Path]
+    """A scene folder of `taa reconstruct --scene`, its cues replaced or not."""
+    focal: float | None = None
+    """Focal length of the upright full-size frame, px."""
+    out: Path | None = None
+    """JSON file to write the joint into as well."""
+    seed: int = 0
+    """Seed of everything that draws."""
+
+    def run(self) -> Outcome:
+        return commands.fit(self.scene, self.focal, self.out, self.seed)
+
+
+@dataclass(kw_only=True)
+class List(Common):
+    """List the assets there are."""
+
+    def run(self) -> Outcome:
+        return commands.list_assets()
+
+
+@dataclass(kw_only=True)
+class Show(Common):
+    """Show one asset's facts, each number with its origin."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+
+    def run(self) -> Outcome:
+        return commands.show(self.id)
+
+
+@dataclass(kw_only=True)
+class View(Common):
+    """Look at one asset interactively in the browser: the joint, the hand through time."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+    port: int = 8080
+    """Port to serve on."""
+
+    def run(self) -> Outcome:
+        return commands.view(self.id, self.port)
+
+
+@dataclass(kw_only=True)
+class Replay(Common):
+    """Replay the demonstrated hand open loop through contact, with its controls, and score it."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+    hand: str = "points"
+    """Hand that replays."""
+    video: Path | None = None
+    """MP4 file to write: the source video (where its scene is known) beside the replay."""
+
+    def run(self) -> Outcome:
+        return commands.replay(self.id, self.hand, self.video)
+
+
+@dataclass(kw_only=True)
+class Score(Common):
+    """Score a replay that somebody else made."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+    file: tyro.conf.Positional[Path]
+    """A joint log (.csv with the columns time and q) or an action file (.npy, one row an environment step)."""
+    hand: str = "points"
+    """Hand whose actions an action file holds."""
+
+    def run(self) -> Outcome:
+        return commands.score(self.id, self.file, self.hand)
+
+
+@dataclass(kw_only=True)
+class Export(Common):
+    """Write an asset as a self-contained folder for other programs."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+    format: Literal["mjcf"] = "mjcf"
+    """mjcf: a folder with model.xml and its meshes."""
+    out: Path | None = None
+    """Folder to write (default: ./<id>_<format>)."""
+    overwrite: bool = False
+    """Replace that folder."""
+
+    def run(self) -> Outcome:
+        return commands.export(self.id, self.format, self.out, self.overwrite)
+
+
+@dataclass(kw_only=True)
+class Synth(Common):
+    """Render videos with known ground truth."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder to write; one subfolder a clip with video.mp4 and the truth beside it."""
+    clip: str | None = None
+    """Name of one clip (default: all)."""
+    overwrite: bool = False
+    """Replace clips that are there."""
+    seed: int = 0
+    """Seed of textures, noise and hand-held motion."""
+
+    def run(self) -> Outcome:
+        return commands.synth(self.out, self.clip, self.overwrite, self.seed)
+
+
+@dataclass(kw_only=True)
+class Doctor(Common):
+    """Say what is installed, which providers can run here and why the others cannot."""
+
+    rendering: bool = False
+    """Only check off-screen rendering, and fail where it does not work."""
+
+    def run(self) -> Outcome:
+        return commands.doctor(self.rendering)
+
+
+Command = (
+    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Score, tyro.conf.subcommand("score")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (usage errors raise SystemExit(2), as argparse does)."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="taa",
+        description="Articulated objects from casual video: reconstruct, replay, look, export.",
+        args=argv,
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
+    )
+    data: dict | None = None
+    code = 0
+    with _stdout_kept_clean(command.json) as stdout:
+        try:
+            outcome = command.run()
+            if command.json:
+                data = outcome.data
+            else:
+                outcome.show()
+            if outcome.error:
+                print(f"error: {outcome.error}", file=sys.stderr)
+                code = 1
+        except SystemExit:
+            raise
+        except BaseException as error:
+            if command.debug:
+                traceback.print_exc()
+            sentence = error_sentence(error)
+            print(f"error: {sentence}", file=sys.stderr)
+            data, code = {"error": sentence}, 1
+        if command.json:
+            print(json.dumps(data, allow_nan=False), file=stdout, flush=True)
+    return code
+
+
+@contextlib.contextmanager
+def _stdout_kept_clean(wanted: bool) -> Iterator[IO[str]]:
+    """With --json, send whatever libraries print (native ones too) to stderr; yields the real stdout."""
+    if not wanted:
+        yield sys.stdout
+        return
+    sys.stdout.flush()
+    try:
+        target = sys.stdout.fileno()
+    except (OSError, AttributeError):  # a stdout without a file, as tests have
+        real = sys.stdout
+        with contextlib.redirect_stdout(sys.stderr):
+            yield real
+        return
+    kept = os.dup(target)
+    os.dup2(sys.stderr.fileno(), target)
+    try:
+        with os.fdopen(kept, "w", encoding="utf-8") as real:
+            yield real
+    finally:
+        sys.stdout.flush()
+        # Late words of libraries at exit go to stderr too: the descriptor stays redirected.
+
+
+def error_sentence(error: BaseException) -> str:
+    """One line for the user: what is wrong; what to do."""
+    from taa_envs.errors import TaaEnvsError
+
+    text = " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; run the same command again, with --scene it goes on where it was"
+    if isinstance(error, TaaEnvsError) or any(c.__name__ == "TaaError" for c in type(error).__mro__):
+        return text
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = f" at {error.filename}" if error.filename else ""
+        return f"the disk is full{where}; free some space or write elsewhere (--out, --scene, TMPDIR)"
+    if isinstance(error, PermissionError):
+        return f"no permission for {error.filename or 'a file'}; write elsewhere (--out, --scene) or change its mode"
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.strerror or text}: {error.filename}; check the path"
+    if isinstance(error, MemoryError):
+        return "out of memory; give a shorter video or close other programs"
+    return f"{type(error).__name__}: {text[:300]}; run again with --debug and report what it shows"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,369 @@
+"""What each ``taa`` command does: call one function of the library, and put its result into words.
+
+Imports happen inside the functions, so that ``taa list`` does not wait for OpenCV.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from taa_envs.errors import TaaEnvsError
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command hands back.
+
+    Attributes:
+        data: the JSON object of ``--json``, plain types only.
+        show: prints the same for a person.
+        error: one line if the answer is a refusal (exit code 1).
+    """
+
+    data: dict
+    show: Callable[[], None]
+    error: str | None = None
+
+
+class StageBars:
+    """Progress of a pipeline on stderr: a bar a stage on a terminal, else one line a finished stage."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        self.console = Console(stderr=True, highlight=False)
+        self.bars = Progress(
+            SpinnerColumn(finished_text="[green]✓"), TextColumn("{task.description:<10}"), BarColumn(bar_width=32),
+            TimeElapsedColumn(), TextColumn("[dim]{task.fields[note]}"), console=self.console,
+            disable=not self.console.is_terminal,
+        )  # fmt: skip
+        self.task = None
+        self.name = ""
+
+    def __enter__(self) -> StageBars:
+        self.bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bars.stop()
+
+    def start(self, stage: str) -> None:
+        self.name = stage
+        self.task = self.bars.add_task(stage, total=None, note="")
+
+    def update(self, share: float) -> None:
+        if self.task is not None:
+            self.bars.update(self.task, total=1.0, completed=min(max(share, 0.0), 1.0))
+
+    def finish(self, seconds: float, note: str = "") -> None:
+        if self.task is not None:
+            self.bars.update(self.task, total=1.0, completed=1.0, note=note)
+            self.bars.stop_task(self.task)
+        if not self.console.is_terminal:
+            self.console.print(f"{self.name:<10} {seconds:6.1f} s  {note}".rstrip())
+
+
+def reconstruct(video: Path, asset_id: str, scene: Path | None, out: Path | None, focal: float | None,
+                providers: dict[str, str], overwrite: bool, seed: int) -> Outcome:  # fmt: skip
+    from reconstruct.pipeline import reconstruct as run
+
+    with StageBars() as bars:
+        result = run(video, asset_id, scene=scene, out=out, focal=focal, providers=providers, overwrite=overwrite,
+                     seed=seed, progress=bars)  # fmt: skip
+
+    def show() -> None:
+        for note in result.notes:
+            print(f"note: {note}")
+        if result.asset is None:
+            return
+        _table(f"{asset_id}: {result.asset.joint['type']} joint", _joint_rows(result.joint))
+        if result.replay is not None:
+            _table("open-loop replay through contact", replay_rows(result.replay))
+        print(f"asset   {result.asset.path}")
+        print(f"report  {result.asset.path / 'report.html'}")
+        print(f'use     gymnasium.make("TAA/{asset_id}")')
+
+    return Outcome(result.as_dict(), show, result.error)
+
+
+def fit(scene: Path, focal: float | None, out: Path | None, seed: int) -> Outcome:
+    import json
+
+    from reconstruct.pipeline import fit_scene
+
+    with StageBars() as bars:
+        joint = fit_scene(scene, focal=focal, seed=seed, progress=bars)
+    if out is not None:
+        _write_atomically(out, json.dumps(joint, allow_nan=False))
+    refused = f"{joint['reason']}; see the video's notes in the scene folder" if joint["verdict"] == "refused" else None
+    return Outcome(joint, lambda: _table(f"{scene}: {joint['verdict']}", _joint_rows(joint)), refused)
+
+
+def list_assets() -> Outcome:
+    from taa_envs import registry
+    from taa_envs.asset import read_metadata
+
+    rows = []
+    for asset_id, path in sorted(registry.find_assets().items()):
+        joint = read_metadata(path)["joint"]
+        rows.append({"id": asset_id, "path": str(path), "type": joint["type"], "verdict": joint.get("verdict")})
+
+    def show() -> None:
+        if not rows:
+            print("no assets yet; make one with: taa reconstruct VIDEO --id ID")
+            return
+        _table(None, [(r["id"], r["type"], r["verdict"] or "", r["path"]) for r in rows])
+
+    return Outcome({"assets": rows}, show)
+
+
+def show(asset_id: str) -> Outcome:
+    from taa_envs import registry
+
+    asset = registry.get_asset(asset_id)
+    data = {**asset.metadata, "path": str(asset.path)}
+
+    def words() -> None:
+        _table(f"{asset.id}: {asset.joint['type']} joint, {asset.path}", _joint_rows(asset.joint))
+        rows = [(name, _short(p["value"]), p.get("unit", ""), p["origin"], _short(p.get("std")))
+                for name, p in sorted(asset.provenance.items())]  # fmt: skip
+        _table("numbers and where they come from", [("name", "value", "unit", "origin", "std"), *rows], header=True)
+        for note in asset.metadata.get("notes", ()):
+            print(f"note: {note}")
+
+    return Outcome(data, words)
+
+
+def view(asset_id: str, port: int) -> Outcome:
+    from taa_envs import registry
+    from taa_envs.viewer import serve
+
+    asset = registry.get_asset(asset_id)
+    try:
+        server = serve(asset, port)
+    except ImportError:
+        raise TaaEnvsError("the viewer needs the package viser; install it with: pip install 'taa-envs[view]'") from None
+    url = f"http://localhost:{server.get_port()}"
+    print(f"{asset_id} at {url}; stop with Ctrl-C", file=sys.stderr)
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        server.stop()
+    return Outcome({"id": asset_id, "url": url}, lambda: None)
+
+
+def replay(asset_id: str, hand: str, video: Path | None) -> Outcome:
+    from taa_envs import registry
+    from taa_envs.replay import replay as run
+
+    asset = registry.get_asset(asset_id)
+    if video is not None and not video.parent.is_dir():
+        raise TaaEnvsError(f"no such folder: {video.parent}; make it first")
+    result = run(asset, hand)
+    data = result.as_dict()
+    if video is not None:
+        from reconstruct.film import replay_video
+
+        replay_video(asset, result, hand, video)
+
+    def words() -> None:
+        _table(f"{asset_id}: open-loop replay, hand {hand}", replay_rows(data))
+        for note in result.notes:
+            print(f"note: {note}")
+        if video is not None:
+            print(f"video   {video}")
+
+    return Outcome(data, words)
+
+
+def score(asset_id: str, file: Path, hand: str) -> Outcome:
+    from taa_envs import registry, scoring
+
+    asset = registry.get_asset(asset_id)
+    try:
+        if file.suffix == ".npy":
+            data = scoring.score_actions(asset, np.load(file, allow_pickle=False), hand)
+        else:
+            data = scoring.score_joint_log(asset, *read_joint_log(file))
+    except ValueError as error:
+        raise TaaEnvsError(f"{file}: {error}") from None
+    return Outcome(data, lambda: _table(f"{asset_id}: {file}", replay_rows(data)))
+
+
+def read_joint_log(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Columns time (N,) s and q (N,) of a joint log; extra columns are ignored.
+
+    Raises:
+        TaaEnvsError: a column is missing or a row does not hold numbers.
+    """
+    with file.open(newline="", encoding="utf-8") as f:
+        rows = csv.DictReader(f)
+        missing = {"time", "q"} - set(rows.fieldnames or ())
+        if missing:
+            raise TaaEnvsError(f"{file} has no column {' and '.join(sorted(missing))}; a joint log is a CSV with time "
+                               "and q, an action file an .npy array")  # fmt: skip
+        time, q = [], []
+        for row in rows:
+            try:
+                time.append(float(row["time"]))
+                q.append(float(row["q"]))
+            except (TypeError, ValueError):
+                raise TaaEnvsError(f"{file}, line {rows.line_num}: time and q must be numbers; mend that row") from None
+    return np.asarray(time), np.asarray(q)
+
+
+def export(asset_id: str, kind: str, out: Path | None, overwrite: bool) -> Outcome:
+    from taa_envs import registry
+
+    asset = registry.get_asset(asset_id)
+    target = out if out is not None else Path(f"{asset_id}_{kind}")
+    if target.exists() and not overwrite:
+        raise TaaEnvsError(f"{target} exists; choose another --out or use --overwrite")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        shutil.copyfile(asset.model_path, work / "model.xml")
+        shutil.copytree(asset.path / "meshes", work / "meshes")
+        work.chmod(0o755)
+        _swap(work, target)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return Outcome({"id": asset_id, "format": kind, "path": str(target)}, lambda: print(target / "model.xml"))
+
+
+def synth(out: Path, clip: str | None, overwrite: bool, seed: int) -> Outcome:
+    from reconstruct.synth import list_clips, write_clip
+
+    names = [clip] if clip is not None else list_clips()
+    written = []
+    with StageBars() as bars:
+        for name in names:
+            begin = time.monotonic()
+            bars.start(name)
+            written.append(str(write_clip(out, name, seed=seed, overwrite=overwrite, progress=bars.update)))
+            bars.finish(time.monotonic() - begin)
+    return Outcome({"clips": written}, lambda: print("\n".join(written)))
+
+
+def doctor(rendering: bool) -> Outcome:
+    from taa_envs import doctor as checks
+
+    if rendering:
+        backend = checks.check_rendering()
+        return Outcome({"rendering": backend}, lambda: print(f"off-screen rendering works ({backend})"))
+    data = checks.examine()
+
+    def words() -> None:
+        print(f"Python {data['python']}, {data['machine']}")
+        _table("packages", [(name, version or "not installed") for name, version in data["packages"].items()])
+        rows = [(p["cue"], p["name"], "runs" if p["runs"] else "cannot run", p["why"]) for p in data["providers"]]
+        _table("providers", rows)
+        print("rendering: " + (data["rendering"]["backend"] if data["rendering"]["works"] else data["rendering"]["why"]))
+        print("assets are looked for in " + ", ".join(data["assets"]))
+
+    return Outcome(data, words)
+
+
+def replay_rows(result: dict) -> list[tuple[str, str]]:
+    """The result table of a replay or a score; rows for the keys that are there."""
+    names = {"joint_progress": "joint progress", "final_q_error": "final q error", "max_progress": "max progress",
+             "contact_fraction": "contact fraction", "wrong_way": "wrong way"}  # fmt: skip
+    rows = [(name, f"{result[key]:.0%}") for key, name in names.items() if key in result]
+    if "max_penetration_m" in result:
+        rows.append(("max penetration", f"{1e3 * result['max_penetration_m']:.1f} mm"))
+    if "is_success" in result:
+        rows.append(("success", "yes" if result["is_success"] else "no"))
+    words = {"no_hand": "without a hand", "mirrored_hand": "mirrored hand", "late_hand": "late hand"}
+    rows += [(f"control: {words.get(k, k)}", f"{v:.0%}") for k, v in (result.get("controls") or {}).items()]
+    return rows
+
+
+def _joint_rows(joint: dict) -> list[tuple[str, str]]:
+    rows = [("verdict", joint["verdict"]), ("reason", joint.get("reason") or "")]
+    if joint.get("type") is None:
+        return rows
+    std = joint.get("std") or {}
+    probability = joint.get("type_probability") or {}
+    sure = ", ".join(f"{name} {p:.2f}" for name, p in probability.items() if p is not None)
+    rows += [("type", joint["type"] + (f" ({sure})" if sure else ""))]
+    rows += [("axis", _short(joint["axis"]) + _plus_minus(std.get("axis_deg"), "deg"))]
+    if joint.get("point") is not None:
+        rows += [("point", _short(joint["point"]) + " m" + _plus_minus(std.get("point_m"), "m"))]
+    q = [v for v in joint.get("q") or () if v is not None]
+    if q:
+        import math
+
+        factor, unit = (1000.0, "mm") if joint["type"] == "prismatic" else (180.0 / math.pi, "deg")
+        rows += [("range", f"{factor * min(q):.1f} to {factor * max(q):.1f} {unit}")]
+    rows += [("scale", f"metric, from {joint.get('scale_source')}" if joint.get("metric") else "not metric")]
+    if joint.get("residual_px") is not None:
+        rows += [("residual", f"{joint['residual_px']:.2f} px, {joint['inliers']} of {joint['tracks']} tracks")]
+    return rows
+
+
+def _plus_minus(std: object, unit: str) -> str:
+    return f"  ± {std:.3g} {unit}" if isinstance(std, (int, float)) else ""
+
+
+def _short(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, (list, tuple)):
+        return "(" + ", ".join(_short(v) for v in value) + ")" if len(value) <= 4 else f"[{len(value)} numbers]"
+    return str(value)
+
+
+def _table(title: str | None, rows: list[tuple], header: bool = False) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title and escape(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD,
+                  show_header=header)  # fmt: skip
+    for name in rows[0] if rows else ():
+        table.add_column(str(name) if header else "", overflow="fold")
+    for row in rows[1:] if header else rows:
+        table.add_row(*(escape(str(cell)) for cell in row))
+    Console(highlight=False).print(table)
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as f:
+            f.write(text)
+        os.replace(partial, path)
+    except BaseException:
+        Path(partial).unlink(missing_ok=True)
+        raise
+
+
+def _swap(work: Path, target: Path) -> None:
+    """Rename a finished folder into place; one that was there is removed after the new one stands."""
+    if not target.exists():
+        work.rename(target)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
+    os.replace(target, aside / "old")
+    try:
+        work.rename(target)
+    except OSError:
+        os.replace(aside / "old", target)
+        raise
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
