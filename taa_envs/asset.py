@@ -80,7 +80,7 @@ class Reference:
             if value.shape != shape:
                 raise AssetError(f"reference array {name!r} has shape {value.shape}, expected {shape}")
             if not np.isfinite(value).all():
-                raise AssetError(f"reference array {name!r} is not finite; interpolate gaps and mark them in hand_valid")
+                raise AssetError(f"reference array {name!r} is not finite; fill gaps and mark them in hand_valid")
         if not (np.diff(values["time"]) > 0).all():
             raise AssetError("reference time does not increase; sort the frames and drop doubles")
         return cls(**values)
@@ -261,7 +261,8 @@ def read_metadata(folder: Path) -> dict:
 
 def _check_joint(joint: dict) -> None:
     if joint.get("type") not in JOINT_TYPES:
-        raise AssetError(f"joint type {str(joint.get('type'))[:40]!r} is not simulated; known: {', '.join(JOINT_TYPES)}")
+        raise AssetError(f"joint type {str(joint.get('type'))[:40]!r} is not simulated; known: "
+                         + ", ".join(JOINT_TYPES))
     axis = _vector(joint.get("axis"), (3,), "joint axis")
     if abs(np.linalg.norm(axis) - 1) > 1e-3:
         raise AssetError(f"joint axis has length {np.linalg.norm(axis):.4g}; normalise it")

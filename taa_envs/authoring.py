@@ -81,7 +81,8 @@ def _demo_speed(reference: Reference, end: int) -> float:
 def _joint_numbers(joint: Mapping) -> tuple[str, np.ndarray, np.ndarray]:
     kind = joint.get("type")
     if kind not in JOINT_TYPES:
-        raise AssetError(f"joint type {kind!r} cannot be simulated as one passive joint; known: {', '.join(JOINT_TYPES)}")
+        raise AssetError(f"joint type {kind!r} cannot be simulated as one passive joint; known: "
+                         + ", ".join(JOINT_TYPES))
     axis = np.asarray(joint["axis"], float)
     point = np.zeros(3) if joint.get("point") is None else np.asarray(joint["point"], float)
     norm = float(np.linalg.norm(axis))
@@ -158,15 +159,16 @@ def _entry(value: object, unit: str, origin: str, std: float | None = None, note
     return entry
 
 
-def _joint_provenance(joint: Mapping, joint_range: tuple[float, float], unit: str, origin: str, range_given: bool) -> dict:
+def _joint_provenance(joint: Mapping, joint_range: tuple[float, float], unit: str, origin: str,
+                      range_given: bool) -> dict:
     std = joint.get("std") or {}
     scale = f" (lengths from: {joint.get('scale_source', 'none')})"
     q_std = np.asarray(std.get("q") if std.get("q") is not None else np.nan, float)
     out = {
         "joint.axis": _entry(joint["axis"], "1", origin, _plain(np.deg2rad(std["axis_deg"]))
                              if std.get("axis_deg") is not None else None, "std: angle, rad"),
-        "joint.q": _entry([float(np.min(joint["q"])), float(np.max(joint["q"]))] if joint.get("q") is not None else None,
-                          unit, origin, _plain(float(np.nanmedian(q_std))) if np.isfinite(q_std).any() else None,
+        "joint.q": _entry([float(np.min(joint["q"])), float(np.max(joint["q"]))], unit, origin,
+                          float(np.nanmedian(q_std)) if np.isfinite(q_std).any() else None,
                           "least and greatest; all of it in reference.npz"),
         "joint.range": _entry(joint_range, unit, "given" if range_given else "observed", None,
                               None if range_given else "the ends the video shows; the real stops may lie beyond"),
@@ -234,7 +236,9 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
                                   - np.outer(centre - point, centre - point))
     inertia = body_mass if kind == "prismatic" else float(axis @ about @ axis)
     offset = np.asarray(moving.vertices, float) - point
-    lever = 1.0 if kind == "prismatic" else float(np.linalg.norm(offset - (offset @ axis)[:, None] * axis, axis=1).max())
+    lever = 1.0
+    if kind == "revolute":
+        lever = float(np.linalg.norm(offset - (offset @ axis)[:, None] * axis, axis=1).max())
     assumed_damping, assumed_friction = passive_forces(inertia, lever, _demo_speed(ref, demo["demo_end_frame"]))
     numbers = {"damping": assumed_damping if damping is None else float(damping),
                "frictionloss": assumed_friction if frictionloss is None else float(frictionloss),

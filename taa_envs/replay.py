@@ -18,9 +18,9 @@ contract, at the end of the replay:
   that lies on the axis), or square to the axis through the centre of mass (prismatic). Reflection turns the
   demonstrated motion about: the hand is as near to the link, on its other side, and moves the wrong way. Finds joints
   that answer to a hand's presence rather than to its push.
-- *late_hand*: the whole hand motion delayed by the time from the onset of the demonstrated stroke (2 % progress) to the
-  replay's end, so that the hand is about to begin when time is up. Finds joints that move by the clock, and starts
-  whose overlap of hand and link alone pushes.
+- *late_hand*: the whole hand motion delayed by the time from the demonstrated onset (the first ``contact`` frame or 1 %
+  progress, whichever is first) to the replay's end, so that the hand is about to begin when time is up. Finds joints
+  that move by the clock, and starts whose overlap of hand and link alone pushes.
 """
 
 from __future__ import annotations
@@ -36,12 +36,14 @@ from taa_envs.simulation import Diverged, HandPath, Simulation, Step
 
 CONTROLS = ("no_hand", "mirrored_hand", "late_hand")
 HOLD = 0.2  # s for which the hand stays at its last pose: time for what it pushes to catch up
-ONSET = 0.02  # progress at which the demonstrated stroke has begun
+ONSET = 0.01  # progress at which the demonstrated stroke has begun
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """One replay, sampled at the reference's frames up to the demonstration's end and once more after the hold.
+
+    A sample is the state of the first simulation step at or after its frame's time, at most a timestep later.
 
     Attributes:
         time: (N,) s of the reference.  q: (N,) simulated.  q_demo: (N,) demonstrated.
@@ -126,7 +128,7 @@ def control_path(scene: Scene, name: str) -> HandPath | None:
         away = (reference.hand_joints - point) @ normal
         return HandPath(reference.time, reference.hand_joints - 2 * away[..., None] * normal)
     if name == "late_hand":
-        onset = int(np.argmax(asset.stroke_fraction(reference.q) >= ONSET))
+        onset = int(np.argmax((asset.stroke_fraction(reference.q) >= ONSET) | reference.contact))
         delay = asset.end_time + HOLD - reference.time[max(onset - 1, 0)]
         return HandPath(reference.time + delay, reference.hand_joints)
     raise ValueError(f"no control is named {name!r}; known: {', '.join(CONTROLS)}")
@@ -161,7 +163,7 @@ def simulate(scene: Scene, path: HandPath | None) -> Trajectory:
         while t >= edges[frame + 1] and frame < end:
             rows.append((*opened, window.contact, window.penetration))
             frame += 1
-            window, opened = Step(), sample(t, frame)
+            window, opened = Step(), sample(float(reference.time[frame]), frame)
         window.add(step := sim.step(path.at(t + lead) if path is not None else None))
         driven += step.driven
         least, most = min(least, sim.q), max(most, sim.q)

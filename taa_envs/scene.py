@@ -102,7 +102,7 @@ def _add_cameras(spec: object, asset: Asset, centre: np.ndarray, size: float) ->
         spec.worldbody.add_camera(
             name="video", pos=position, quat=_quaternion(rotation), resolution=[width, height],
             sensor_size=[width * 1e-5, height * 1e-5], focal_pixel=[K[0, 0], K[1, 1]],
-            principal_pixel=[K[0, 2] - (width - 1) / 2, (height - 1) / 2 - K[1, 2]])
+            principal_pixel=[(width - 1) / 2 - K[0, 2], (height - 1) / 2 - K[1, 2]])
         view = position - centre
     view = view / np.linalg.norm(view)
     position = centre + view * size * 1.9
@@ -158,6 +158,7 @@ def build_spec(asset: Asset, hand: object | None, *, touch_static: bool = False)
     spec.visual.headlight.diffuse = [0.25] * 3
     spec.visual.headlight.specular = [0.0] * 3
     spec.visual.global_.offwidth = spec.visual.global_.offheight = 2560
+    spec.visual.quality.shadowsize = 4096
     spec.visual.map.znear = 0.005
     spec.stat.center, spec.stat.extent = centre, size
     _add_cameras(spec, asset, centre, size)
@@ -190,7 +191,8 @@ def build_scene(asset: Asset, hand: str | object | None = "points", *, touch_sta
     touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    box, _ = _bounds_at_rest(model, data, moving | static)
+    points = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(moving | static)])
+    box = np.stack([points.min(0), points.max(0)])
     surface = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(moving & touching)])
     if len(surface) > 500:
         surface = surface[np.linspace(0, len(surface) - 1, 500).astype(int)]
@@ -198,8 +200,3 @@ def build_scene(asset: Asset, hand: str | object | None = "points", *, touch_sta
                  qpos=int(model.joint("joint").qposadr[0]), dof=int(model.joint("joint").dofadr[0]),
                  hand_geoms=touching & ~moving & ~static, moving_geoms=touching & moving, surface=surface,
                  centre=box.mean(0), size=float(np.linalg.norm(box[1] - box[0])))
-
-
-def _bounds_at_rest(model: object, data: object, geoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    points = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(geoms)])
-    return np.stack([points.min(0), points.max(0)]), points

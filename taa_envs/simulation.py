@@ -78,6 +78,8 @@ class Simulation:
         self._mujoco = mujoco
         self._contact_rows = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
         self._force = np.zeros(scene.model.nv)
+        # MuJoCo resets a state that is not finite and counts it here.
+        self._bad = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 
     @property
     def q(self) -> float:
@@ -132,7 +134,7 @@ class Simulation:
         force = self._contact_force()
         contact, penetration = self._touching()
         moved = self.q - before
-        if not np.isfinite(self.q) or self.data.warning[int(self._mujoco.mjtWarning.mjWARN_BADQACC)].number:
+        if any(self.data.warning[w].number for w in self._bad):
             raise Diverged(f"the simulation of {self.scene.asset.id} became unstable at {self.data.time:.3f} s")
         along = moved * self.direction
         driven = along if along > 0 and force * moved > 0 else 0.0

@@ -37,7 +37,8 @@ def _refine(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> tup
         split = np.flatnonzero((np.ptp(corners, axis=1).max(axis=1) > COLOUR_STEP) & (edges > smallest))
         if not len(split) or len(faces) + 3 * len(split) > MAX_FACES:
             break
-        vertices, faces, attributes = subdivide(vertices, faces, face_index=split, vertex_attributes={"colour": colours})
+        vertices, faces, attributes = subdivide(vertices, faces, face_index=split,
+                                                vertex_attributes={"colour": colours})
         colours = attributes["colour"]
     return vertices, faces, colours
 
@@ -122,4 +123,5 @@ def link_inertia(link: object, density: float, mass: float | None = None
     tensor = (tensor + tensor.T) / 2 + 1e-3 * np.trace(tensor) * np.eye(3)
     if not (volume > 0 and np.linalg.eigvalsh(tensor)[0] > 0):
         raise AssetError("the moving link encloses no volume; close its surface")
-    return volume * scale, np.asarray(surface.center_mass, float), tensor, volume, "mass given" if mass else how
+    return (volume * density if mass is None else mass, np.asarray(surface.center_mass, float), tensor, volume,
+            how if mass is None else "mass given")

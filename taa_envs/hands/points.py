@@ -69,7 +69,7 @@ class PointsHand:
         import mujoco
 
         weights = sphere_weights()
-        for i, row in enumerate(weights):
+        for i in range(len(weights)):
             tip = i in TIPS
             body = spec.worldbody.add_body(name=f"hand{i}")
             body.gravcomp = 1.0
