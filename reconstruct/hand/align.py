@@ -1,0 +1,270 @@
+"""From hands in the picture to a demonstration that drives the part in physics.
+
+One view leaves the hand's depth open, and millimetres decide between pushing, missing and sweeping the part away. What
+settles it is that a hand which drives a part is nearly still in the part's frame: there the frames of a stroke are
+many looks at one pose. That pose, moved as little as the evidence allows, becomes a grip (:mod:`.grip`) and is carried
+with the part; before and after, the hand follows what was seen, clear of the part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruct.cues import HandReference, Hands, LinkMasks
+from reconstruct.geometry import Geometry
+from reconstruct.hand.drive import Drive, close_gaps, find_drive, moving_frames, runs
+from reconstruct.hand.grip import RADII, SPHERES, Grip, find_grips
+from reconstruct.hand.path import clear_path, exit_direction
+from reconstruct.hand.pnp import hand_positions
+from reconstruct.hand.shape import LinkShape
+from reconstruct.hand.skeleton import HAND_SIZE_STD, TIPS, one_anatomy
+from reconstruct.joint.models import JointFit
+from reconstruct.video import Video
+
+CARRY_SECONDS = 0.5  # a hand lost for longer than this before the part moves was not holding it
+REST_STD = 0.015  # m, how still a driving hand's tips are in the link's frame
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The driving hand as seen: camera (T, 21, 3) m with gaps filled, valid (T,) where it was not filled."""
+
+    camera: np.ndarray
+    valid: np.ndarray
+
+
+def _smooth(x: np.ndarray, sigma: float) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter1d
+
+    return gaussian_filter1d(x, max(sigma, 1e-3), axis=0, mode="nearest")
+
+
+def _fill(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Linear in time between valid frames, constant beyond them."""
+    t = np.arange(len(x))
+    flat = x.reshape(len(x), -1)
+    out = np.stack([np.interp(t, t[valid], column[valid]) for column in flat.T], axis=1)
+    return out.reshape(x.shape)
+
+
+def observe(hands: Hands, index: int, K: np.ndarray, rate: float) -> Seen:
+    """Landmarks of one hand in the camera's frame, gaps filled, depth and shape smoothed, image place kept."""
+    hand = hands.tracks[index]
+    camera, _ = hand_positions(hand, K)
+    valid = np.isfinite(camera[:, 0, 0])
+    camera = _fill(camera, valid)
+    # Depth errs in bursts of frames, the image place does not: smooth the depth alone, along the rays.
+    depth = np.log(camera[..., 2].mean(1))
+    half = max(1, round(0.15 * rate))
+    median = np.array([np.median(depth[max(0, t - half) : t + half + 1]) for t in range(len(depth))])
+    slow = _smooth(median, 0.12 * rate)
+    camera = camera * np.exp(slow - depth)[:, None, None]
+    centre = camera.mean(1, keepdims=True)
+    shape = one_anatomy(_smooth(camera - centre, 0.06 * rate), np.where(valid, 1.0, 0.0))
+    return Seen(_smooth(centre, 0.03 * rate) + shape - shape.mean(1, keepdims=True), valid)
+
+
+def _to_world(fit: JointFit, camera: np.ndarray) -> np.ndarray:
+    T = fit.T_camera_world
+    return (camera - T[:3, 3]) @ T[:3, :3]
+
+
+def _to_link(pose: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """World points (T, N, 3) -> link frame, pose (T, 4, 4)."""
+    return np.einsum("tji,tnj->tni", pose[:, :3, :3], world - pose[:, None, :3, 3])
+
+
+def _from_link(pose: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Link-frame points (N, 3) or (T, N, 3) -> world (T, N, 3)."""
+    x = np.broadcast_to(x, (len(pose), *x.shape[-2:]))
+    return np.einsum("tij,tnj->tni", pose[:, :3, :3], x) + pose[:, None, :3, 3]
+
+
+def depth_factor(fit: JointFit, shape: LinkShape, camera: np.ndarray, use: np.ndarray) -> tuple[float, float]:
+    """Common factor on the hand's distance that puts it at the link and at rest in the link's frame.
+
+    Args:
+        camera: (T, 21, 3) m.  use: frames in which the hand drives the link.
+
+    Returns:
+        The factor (the hand grows with it, its image stays) and the spread of the tips in the link's frame, m.
+    """
+    pose = fit.link_pose(fit.q[use])
+    best = (np.inf, 1.0, 0.0)
+    for log in np.linspace(-0.45, 0.45, 61):
+        link = _to_link(pose, _to_world(fit, camera[use] * np.exp(log)))
+        tips = link[:, TIPS]
+        middle = np.median(tips, axis=0)
+        spread = np.median(np.linalg.norm(tips - middle, axis=-1))
+        gap = max(0.0, float(np.sort(shape.distance(middle)[0])[:3].mean()) - RADII[4])
+        # Inside is as wrong as outside.
+        sunk = max(0.0, -float(np.median(shape.distance(link.mean(1))[0])))
+        cost = (log / HAND_SIZE_STD) ** 2 + (spread / REST_STD) ** 2 + (gap / 0.01) ** 2 + (sunk / 0.02) ** 2
+        if cost < best[0]:
+            best = (cost, float(np.exp(log)), float(spread))
+    return best[1], best[2]
+
+
+def rest_pose(link: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """The pose (21, 3) a hand has in the link's frame while it drives it.
+
+    Args:
+        link: (n, 21, 3) m poses in the link's frame.
+        motion: (n,) how much the joint moves in each: where the hand holds on in two places one after the other, the
+            place that moves the link more is taken.
+    """
+    tips = link[:, TIPS].mean(1)
+    near = np.linalg.norm(tips[:, None] - tips[None], axis=-1) < 0.04
+    chosen = near[int((near @ motion).argmax())]
+    return one_anatomy(np.median(link[chosen], axis=0)[None], np.ones(1))[0]
+
+
+def _carried(drive: Drive, valid: np.ndarray, moving: np.ndarray, rate: float) -> np.ndarray:
+    """Frames in which the hand is not seen but must still be holding on: out of the picture while the part moves."""
+    out = np.zeros(len(valid), bool)
+    reach = max(1, round(CARRY_SECONDS * rate))
+    for a, b in runs(~valid):
+        before = a > 0 and drive.attached[max(0, a - reach) : a].any() and drive.near[max(0, a - 3) : a].any()
+        after = b < len(valid) and drive.attached[b : b + reach].any() and drive.near[b : b + 3].any()
+        if before and moving[a:b].any():
+            out[a : a + int(np.flatnonzero(moving[a:b])[-1]) + 1] = True
+        if before and after:
+            out[a:b] = True
+        if after and not before and a == 0:  # held from the start, seen only later
+            out[a:b] = True
+    return out
+
+
+def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, masks: LinkMasks | None = None,
+               check: bool = True) -> HandReference:
+    """The demonstration: the driving hand in the world, as it really pushes the part.
+
+    Args:
+        video: working frames (times only are used).
+        hands: hands of the same frames.
+        fit: metric joint.
+        geometry: both links; the moving one's collision parts are what the hand meets.
+        masks: not used yet.
+        check: replay the candidate grips against the passive joint and keep the first that drives it.
+
+    Returns:
+        The reference. Where no hand drives the part, ``hand_valid`` and ``contact`` are all False, the landmarks
+        rest away from the part, and the notes say why.
+    """
+    time = video.time
+    rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
+    shape = LinkShape(geometry.moving)
+    moving = moving_frames(fit, time)
+    drive = find_drive(hands, fit, time, np.asarray(geometry.moving.vertices))
+    if drive.index is None:
+        drive = find_drive(hands, fit, time)
+    if drive.index is None:
+        why = "no hand was seen" if not hands.tracks else "no hand moves with the part while it moves"
+        return _absent(video, fit, shape, f"{why}: the demonstration holds no hand that drives the part")
+    hand = hands.tracks[drive.index]
+    notes: list[str] = []
+    seen = observe(hands, drive.index, fit.K, rate)
+    use = drive.drives & seen.valid
+    if use.sum() < 3:
+        return _absent(video, fit, shape, "the driving hand's position could not be computed")
+    factor, spread = depth_factor(fit, shape, seen.camera, use)
+    notes.append(f"hand depth times {factor:.2f} puts it at the part; it then stays within {1e3 * spread:.0f} mm "
+                 f"in the part's frame while it drives it")
+    world = _to_world(fit, seen.camera * factor)
+    pose = fit.link_pose(fit.q)
+    carried = _carried(drive, hand.valid, moving, rate)
+    attached = close_gaps(drive.attached | carried, round(0.2 * rate))
+    if carried.any():
+        notes.append(f"hand not seen in {int((carried & moving).sum())} frames in which the part moves: "
+                     "assumed to hold on, carried with the part")
+    sign = _stroke_sign(fit.q)
+    forward = np.maximum(sign * np.gradient(fit.q), 0.0)
+    grips: list[Grip] = []
+    weight = forward[use] if forward[use].sum() > 0 else np.abs(np.gradient(fit.q))[use]
+    rest = rest_pose(_to_link(pose[use], world[use]), weight)
+    key = int(np.flatnonzero(use)[weight.argmax()])
+    centre = -fit.T_camera_world[:3, :3].T @ fit.T_camera_world[:3, 3]
+    ray = pose[key, :3, :3].T @ (world[key].mean(0) - centre)
+    grips = find_grips(shape, fit, sign, rest, ray / np.linalg.norm(ray))
+    if not grips:
+        notes.append("no face of the part looks against its motion within the hand's reach: pose left as seen")
+        grips = [Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0.0)]
+    made = [(grip, _assemble(fit, shape, world, pose, attached, grip, rest, rate)) for grip in grips]
+
+    def reference(joints: np.ndarray, words: list[str]) -> HandReference:
+        return HandReference(time.copy(), fit.q.copy(), joints, seen.valid & ~carried, attached & moving, hand.side,
+                             (*notes, *words))
+
+    chosen, progress = 0, None
+    if check:
+        from reconstruct.hand.check import replay_progress
+
+        scores = []
+        for _, joints in made:
+            scores.append(replay_progress(fit, geometry, reference(joints, [])))
+            if scores[-1] >= 0.9:
+                break
+        chosen = int(np.argmax(scores))
+        progress = scores[chosen]
+    grip, joints = made[chosen]
+    words = [f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
+             f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was seen"]
+    if progress is not None:
+        words.append(f"replayed against the passive joint: progress {progress:.2f} with candidate {chosen + 1} "
+                     f"of {len(made)}")
+    return reference(joints, words)
+
+
+def _stroke_sign(q: np.ndarray) -> float:
+    from taa_envs.asset import demonstration
+
+    demo = demonstration(q)
+    return float(np.sign(demo["q_demo_end"] - demo["q_start"]))
+
+
+def _assemble(fit: JointFit, shape: LinkShape, world: np.ndarray, pose: np.ndarray, attached: np.ndarray, grip: Grip,
+              rest: np.ndarray, rate: float) -> np.ndarray:
+    """World landmarks (T, 21, 3): carried with the link while attached, as seen and clear of the link otherwise."""
+    n = len(world)
+    held = _from_link(pose, grip.pose)
+    out, offset = world.copy(), np.zeros_like(world)
+    stretches = runs(attached)
+    for a, b in stretches:
+        offset[a:b] = held[a:b] - world[a:b]
+    free = ~attached
+    # The correction fades with the distance in time from the grip.
+    t = np.arange(n)
+    if stretches:
+        anchor = np.flatnonzero(attached)
+        left = anchor[np.clip(np.searchsorted(anchor, t, "right") - 1, 0, len(anchor) - 1)]
+        right = anchor[np.clip(np.searchsorted(anchor, t, "left"), 0, len(anchor) - 1)]
+        fade = 1.5 * rate
+        wl = np.where(left <= t, np.exp(-np.abs(t - left) / fade), 0.0)
+        wr = np.where(right >= t, np.exp(-np.abs(t - right) / fade), 0.0)
+        total = np.maximum(wl + wr, 1e-9)
+        blend = (wl**2 / total)[:, None, None] * offset[left] + (wr**2 / total)[:, None, None] * offset[right]
+        offset[free] = blend[free]
+    out = world + offset
+    out[attached] = held[attached]
+    if not free.any() or not stretches:
+        return out
+    away = exit_direction(shape, grip.pose, _to_link(pose, world)[free].mean((0, 1)) - grip.pose.mean(0))
+    return clear_path(shape, pose, out, attached, away, rate)
+
+
+def _absent(video: Video, fit: JointFit, shape: LinkShape, note: str) -> HandReference:
+    n = len(video.time)
+    # A reference must be finite: an open hand, well away from everything the link sweeps.
+    far = shape.centre + np.array([0.0, 0.0, 3.0 * shape.size + 0.5])
+    joints = np.zeros((21, 3))
+    for f in range(5):
+        for j in range(4):
+            joints[1 + 4 * f + j] = (0.02 * (f - 2), 0.05 + 0.025 * j, 0.0)
+    nobody = np.zeros(n, bool)
+    return HandReference(video.time.copy(), fit.q.copy(), np.broadcast_to(joints + far, (n, 21, 3)).copy(), nobody,
+                         nobody.copy(), "right", (note,))
+
+
+__all__ = ["align_hand", "depth_factor", "observe", "rest_pose", "SPHERES"]

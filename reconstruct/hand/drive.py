@@ -1,0 +1,146 @@
+"""Which hand drives the part, and in which frames.
+
+A hand drives the part in a frame if the part moves, the hand is at the part's picture, and the hand's landmarks move
+over the picture as the part's surface does there. A hand that only passes by, holds the other link or presses a button
+fails the last test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruct.cues import Hands, HandTrack
+from reconstruct.hand.skeleton import CONTACT, palm_pixels
+from reconstruct.joint.models import JointFit
+
+NEAR = 0.6  # palm sizes between the nearest finger joint and the part's outline
+AGREE = 0.5  # difference of the motions, relative to the part's own
+WINDOWS = (0.2, 0.4, 0.7, 1.0)  # s over which motion is compared, the shortest that shows enough of it
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The driving hand.
+
+    Attributes:
+        index: which of ``Hands.tracks``; None where no hand drives the part.
+        near: (T,) bool, the hand is seen at the part.
+        drives: (T,) bool, it is seen to drive it.
+        attached: (T,) bool, it is at the part and moves (or rests) with it; short gaps are closed.
+    """
+
+    index: int | None
+    near: np.ndarray
+    drives: np.ndarray
+    attached: np.ndarray
+
+
+def moving_frames(fit: JointFit, time: np.ndarray) -> np.ndarray:
+    """(T,) bool, frames in which the joint moves at more than 3 % of its range a second, smoothed over 0.2 s."""
+    rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
+    half = max(1, round(0.1 * rate))
+    t = np.arange(len(fit.q))
+    low, high = np.clip(t - half, 0, len(t) - 1), np.clip(t + half, 0, len(t) - 1)
+    speed = np.abs(fit.q[high] - fit.q[low]) / np.maximum(time[high] - time[low], 1e-6)
+    return speed > max(0.03 * float(np.ptp(fit.q)), 1e-9)
+
+
+def close_gaps(flags: np.ndarray, length: int) -> np.ndarray:
+    """Fill runs of False of at most this many frames between True ones."""
+    out = flags.copy()
+    on = np.flatnonzero(flags)
+    for a, b in zip(on, on[1:], strict=False):
+        if 1 < b - a <= length + 1:
+            out[a:b] = True
+    return out
+
+
+def runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Half-open (start, stop) of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _outside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """Distance (n,) px from points to a convex outline, 0 inside."""
+    import cv2
+
+    hull = cv2.convexHull(outline.astype(np.float32))
+    return np.array([max(0.0, -cv2.pointPolygonTest(hull, (float(u), float(v)), True)) for u, v in points])
+
+
+def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndarray, moving: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """near (T,), drives (T,) of one hand; surface (M, 3): points of the link at q = 0, world."""
+    n = len(time)
+    near, agree = np.zeros(n, bool), np.zeros(n, bool)
+    pose = fit.link_pose(fit.q)
+    picture = [fit.project(surface @ pose[t, :3, :3].T + pose[t, :3, 3]) for t in range(n)]
+    for t in np.flatnonzero(hand.valid):
+        apart = _outside(hand.uv[t, CONTACT], picture[t])
+        near[t] = apart.min() < NEAR * palm_pixels(hand.uv[t])
+    rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
+    spans = np.unique(np.round(0.5 * np.array(WINDOWS) * rate).astype(int).clip(1))
+    for t in np.flatnonzero(near & moving):
+        size = float(palm_pixels(hand.uv[t]))
+        gap = np.linalg.norm(hand.uv[t, CONTACT][:, None] - picture[t][None], axis=-1)
+        # The part's motion at its surface points nearest to the hand.
+        beside = np.unique(np.argsort(gap, axis=1)[:, : min(3, gap.shape[1])])
+        for half in spans:
+            a, b = max(0, t - half), min(n - 1, t + half)
+            a, b = a + int(np.argmax(hand.valid[a : t + 1])), b - int(np.argmax(hand.valid[t : b + 1][::-1]))
+            part = np.median(picture[b][beside] - picture[a][beside], axis=0)
+            if np.linalg.norm(part) < 0.25 * size:  # too little to tell a moving hand from a resting one: look longer
+                continue
+            own = np.median(hand.uv[b, CONTACT] - hand.uv[a, CONTACT], axis=0)
+            agree[t] = np.linalg.norm(own - part) < AGREE * np.linalg.norm(part)
+            break
+    return near, near & moving & agree
+
+
+def _majority(flags: np.ndarray, among: np.ndarray, half: int) -> np.ndarray:
+    """Flags that hold in most of the ``among`` frames around."""
+    votes = np.convolve((flags & among).astype(float), np.ones(2 * half + 1), "same")
+    total = np.convolve(among.astype(float), np.ones(2 * half + 1), "same")
+    return among & (votes > 0.5 * np.maximum(total, 1))
+
+
+def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarray | None = None) -> Drive:
+    """The hand that drives the part.
+
+    Args:
+        hands: all hands.
+        fit: the joint (metric or not).
+        time: (T,) s.
+        surface: (M, 3) points of the moving link at q = 0, world; default the fit's.
+    """
+    n = len(time)
+    nobody = np.zeros(n, bool)
+    surface = fit.points if surface is None else surface
+    if not hands.tracks or surface is None or len(surface) < 3:
+        return Drive(None, nobody, nobody, nobody)
+    moving = moving_frames(fit, time)
+    rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
+    # Evidence weighs as much as the joint moves meanwhile.
+    motion = np.abs(np.gradient(fit.q))
+    best, best_motion = None, 0.0
+    for i, hand in enumerate(hands.tracks):
+        near, drives = _evidence(hand, fit, time, surface, moving)
+        drives = _majority(drives, near & moving, max(2, round(0.15 * rate)))
+        driven = float(motion[drives].sum())
+        if driven > best_motion:
+            best, best_motion = (i, near, drives), driven
+    if best is None or best_motion < 0.05 * float(motion.sum()) or best[2].sum() < 3:
+        return Drive(None, nobody, nobody, nobody)
+    index, near, drives = best
+    valid = hands.tracks[index].valid
+    attached = close_gaps(drives, 4)
+    # Between two driven stretches a hand that never leaves the part rests on it.
+    stretches = runs(attached)
+    for (_, a), (b, _) in zip(stretches, stretches[1:], strict=False):
+        seen = valid[a:b]
+        if not (seen & ~near[a:b]).any() and (near[a:b].sum() >= 0.8 * seen.sum()):
+            attached[a:b] = True
+    return Drive(index, near, drives, attached)

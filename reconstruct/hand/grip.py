@@ -1,0 +1,171 @@
+"""How the hand holds the link: small corrections of its pose that let finger tips push.
+
+All in the link's frame, where a hand that drives the link is still. A grip puts finger tips (or the thumb) on faces of
+the link that look against the motion, pressed in by a few millimetres because position actuators push only with the
+distance that they are behind; the thumb takes the other side where it reaches. Among all grips the one nearest to what
+was seen comes first: cheap along the viewing ray, where a single view is blind, dear across it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from reconstruct.hand.shape import LinkShape, drive_direction, lever
+from reconstruct.hand.skeleton import FINGERS, reach
+from reconstruct.joint.models import JointFit
+
+PRESS = 0.004  # m by which pushing tips are aimed below the surface
+RAY_STD, ACROSS_STD = 0.05, 0.018  # m, what the image says about the hand's place along and across the viewing ray
+TURN_STD = np.deg2rad(25.0)
+AGAINST = -0.55  # cosine between a pushed face's normal and the motion
+FINGER_REACH = 0.035  # m by which a finger may be bent onto the surface
+GROUPS = ((8, 12, 16), (8, 12), (8, 12, 16, 20), (4,), (4, 8, 12))
+"""Finger tips that push together."""
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A pose of the hand (21, 3) m in the link's frame that can drive the link.
+
+    Attributes:
+        kind: "push" or "pinch" (thumb on the other side).
+        shift: (3,) m and turn: rad, how the hand was moved from where it was seen.
+        pushing: number of contact spheres on faces that look against the motion.
+        cost: smaller is nearer to the evidence.
+    """
+
+    pose: np.ndarray
+    kind: str
+    shift: np.ndarray
+    turn: float
+    pushing: int
+    cost: float
+
+
+def _spheres() -> tuple[np.ndarray, np.ndarray]:
+    from taa_envs.hands.points import TIPS, PointsHand, sphere_weights
+
+    weights, hand = sphere_weights(), PointsHand()
+    radius = np.full(len(weights), hand.radius)
+    radius[list(TIPS)] = hand.tip_radius
+    return weights, radius
+
+
+SPHERES, RADII = _spheres()
+
+
+def penetration(shape: LinkShape, pose: np.ndarray) -> np.ndarray:
+    """(..., S) m by which the hand's spheres overlap the link, 0 where they do not."""
+    return np.maximum(RADII - shape.distance(SPHERES @ pose)[0], 0.0)
+
+
+def _turns() -> list[Rotation]:
+    out = [Rotation.identity()]
+    for degrees in (25.0, 50.0):
+        for axis in np.vstack([np.eye(3), -np.eye(3)]):
+            out.append(Rotation.from_rotvec(np.deg2rad(degrees) * axis))
+    return out
+
+
+def _pushing(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray) -> np.ndarray:
+    """(S,) bool, spheres that overlap a face that looks against the motion."""
+    x = SPHERES @ pose
+    distance, normal = shape.distance(x)
+    against = np.einsum("...i,...i->...", normal, drive_direction(fit, x, sign)) < AGAINST
+    return against & (distance < RADII - 0.001)
+
+
+def _overlap_cost(deep: np.ndarray, tips: tuple[int, ...]) -> np.ndarray:
+    """Penetration beyond the press, over the spheres; (..., S) -> (...)."""
+    allowed = np.full(deep.shape[-1], 0.002)
+    allowed[list(tips)] = PRESS + 0.004
+    return (np.minimum(np.maximum(deep - allowed, 0.0) / 0.004, 5.0) ** 2).sum(-1)
+
+
+def _bend(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, tips: tuple[int, ...], faces: np.ndarray
+          ) -> np.ndarray:
+    """Bend the fingers of these tips so that the tips press on the given surface samples (indices)."""
+    out = pose.copy()
+    aims = shape.points[faces] + shape.normals[faces] * (RADII[tips[0]] - PRESS)
+    for tip in tips:
+        gap = np.linalg.norm(aims - out[tip], axis=1)
+        k = int(gap.argmin())
+        if gap[k] > FINGER_REACH:
+            continue
+        # Onto the face straight below the tip, not onto the nearest sample.
+        i = faces[k]
+        height = (out[tip] - shape.points[i]) @ shape.normals[i]
+        target = out[tip] - shape.normals[i] * (height - RADII[tip] + PRESS)
+        if shape.distance(target)[0] > RADII[tip] or np.linalg.norm(target - aims[k]) > 0.02:
+            target = aims[k]
+        finger = list(next(f for f in FINGERS if tip in f))
+        out[finger] = reach(out[finger], target)
+    return out
+
+
+def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, ray: np.ndarray, limit: int = 4
+               ) -> list[Grip]:
+    """Grips that can drive the link, nearest to the evidence first.
+
+    Args:
+        shape: the link.
+        fit: the joint, metric.
+        sign: +1 where the link is driven towards larger q, -1 otherwise.
+        seen: (21, 3) m, where the hand was seen, link frame.
+        ray: (3,) unit viewing direction there, link frame.
+        limit: at most this many, clearly different ones.
+    """
+    direction = drive_direction(fit, shape.points, sign)
+    facing = np.einsum("ij,ij->i", shape.normals, direction)
+    arm = lever(fit, shape.points)
+    useful = arm > 0.3 * arm.max()
+    push, other = np.flatnonzero((facing < AGAINST) & useful), np.flatnonzero((facing > -AGAINST) & useful)
+    if not len(push):
+        return []
+    turns = _turns()
+    found: list[tuple[float, Grip]] = []
+    for g, tips in enumerate(GROUPS):
+        anchor = seen[list(tips)].mean(0)
+        aims = shape.points[push] + shape.normals[push] * (RADII[tips[0]] - PRESS)
+        d = aims - anchor
+        along = d @ ray
+        across = np.linalg.norm(d - along[:, None] * ray, axis=1)
+        prior = (along / RAY_STD) ** 2 + (across / ACROSS_STD) ** 2
+        near = np.argsort(prior)[:80]
+        best: list[tuple[float, int, int]] = []
+        for k, turn in enumerate(turns):
+            turned = turn.apply(seen - anchor)
+            poses = turned[None] + aims[near][:, None]
+            deep = penetration(shape, poses)
+            x = poses[:, list(tips)]
+            # Tips that float far off the surface cannot all be bent onto it.
+            off = np.maximum(shape.distance(x)[0] - 0.02, 0).sum(1) / 0.02
+            cost = prior[near] + (turn.magnitude() / TURN_STD) ** 2 + _overlap_cost(deep, tips) + off
+            best += [(float(cost[j]), int(near[j]), k) for j in np.argsort(cost)[:4]]
+        for _, j, k in sorted(best)[:10]:
+            turn = turns[k]
+            pose = turn.apply(seen - anchor) + aims[j]
+            bent = _bend(shape, fit, sign, pose, tips, push)
+            kind = "push"
+            if 4 not in tips and len(other):
+                pinched = _bend(shape, fit, sign, bent, (4,), other)
+                extra = _overlap_cost(penetration(shape, pinched), (*tips, 4)) - _overlap_cost(
+                    penetration(shape, bent), (*tips, 4))
+                if not np.allclose(pinched[4], bent[4]) and extra < 1.0:
+                    bent, kind = pinched, "pinch"
+            pushing = int(_pushing(shape, fit, sign, bent).sum())
+            wrong = _overlap_cost(penetration(shape, bent), (*tips, 4) if kind == "pinch" else tips)
+            cost = prior[j] + (turn.magnitude() / TURN_STD) ** 2 + wrong + 4.0 * max(0, 3 - pushing) + 0.3 * g
+            if pushing:
+                found.append((float(cost), Grip(bent, kind, aims[j] - anchor, turn.magnitude(), pushing, float(cost))))
+    found.sort(key=lambda item: item[0])
+    out: list[Grip] = []
+    for _, grip in found:
+        if all(np.abs(grip.pose - kept.pose).max() > 0.02 for kept in out):
+            out.append(grip)
+        if len(out) == limit:
+            break
+    return out

@@ -1,0 +1,146 @@
+"""Hands in space: position, driving hand, scale, and demonstrations that drive the part through contact."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reconstruct.cues import Hands, HandTrack
+from reconstruct.hand.align import align_hand
+from reconstruct.hand.drive import close_gaps, find_drive, runs
+from reconstruct.hand.grip import penetration
+from reconstruct.hand.pnp import hand_positions
+from reconstruct.hand.scale import hand_scale, rescale
+from reconstruct.hand.shape import LinkShape
+from reconstruct.hand.skeleton import bone_lengths, one_anatomy, reach
+from taa_envs.authoring import save_asset
+from taa_envs.replay import replay
+from tests.reconstruct.hand_scenes import Scene, make_scene
+
+
+def replayed(scene: Scene, reference, folder) -> dict:
+    joint = {"type": scene.fit.type, "axis": scene.fit.axis, "point": scene.fit.point}
+    asset = save_asset(folder, "trial", joint=joint, static=scene.geometry.static, moving=scene.geometry.moving,
+                       reference=reference)  # fmt: skip
+    return replay(asset).as_dict()
+
+
+def held_still(track: HandTrack, frame: int) -> HandTrack:
+    n = len(track.valid)
+    return replace(track, uv=np.repeat(track.uv[frame : frame + 1], n, 0), valid=np.ones(n, bool),
+                   metric=np.repeat(track.metric[frame : frame + 1], n, 0))  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed"), [("demo", 0), ("laptop", 1), ("drawer", 1), ("oven", 0)])
+def test_a_monocular_hand_becomes_one_that_drives_the_part(name: str, seed: int, tmp_path) -> None:
+    scene = make_scene(name, seed)
+    reference = align_hand(scene.video, scene.hands, scene.fit, scene.geometry)
+    assert np.isfinite(reference.hand_joints).all()
+    result = replayed(scene, reference, tmp_path)
+    assert result["joint_progress"] >= 0.9
+    assert max(result["controls"].values()) < 0.1
+    assert result["contact_fraction"] > 0.8
+    # Contact is claimed only while the true hand holds on, and in most of the frames in which it moves the part.
+    moves = np.abs(np.gradient(scene.fit.q)) > 0.1 * np.abs(np.gradient(scene.fit.q)).max()
+    assert not reference.contact[~scene.motion.contact].any()
+    assert reference.contact[moves].mean() > 0.8
+    assert not reference.hand_valid[40:48].any()
+    assert any("not seen" in note for note in reference.notes)
+    # Anatomy stays one, and the hand stays near the true one.
+    assert np.linalg.norm(reference.hand_joints - scene.joints, axis=-1).mean(1)[moves].max() < 0.09
+    # No jumps: a person's hand stays below 3 m/s.
+    speed = np.linalg.norm(np.diff(reference.hand_joints, axis=0), axis=-1).max() * 30
+    assert speed < 3.0
+
+
+def test_a_still_part_has_no_driving_hand() -> None:
+    scene = make_scene("demo")
+    # The part springs open by itself: same joint motion, but the hand never leaves its first place.
+    track = scene.hands.tracks[0]
+    there = held_still(track, 22)
+    hands = Hands((there,), scene.hands.mask, scene.hands.provider)
+    drive = find_drive(hands, scene.fit, scene.video.time)
+    assert drive.index is None
+    reference = align_hand(scene.video, hands, scene.fit, scene.geometry)
+    assert not reference.contact.any() and not reference.hand_valid.any()
+    assert "no hand moves with the part" in reference.notes[0]
+    assert penetration(LinkShape(scene.geometry.moving), reference.hand_joints[0]).max() == 0
+
+
+def test_no_hand_at_all_is_said() -> None:
+    scene = make_scene("demo")
+    reference = align_hand(scene.video, Hands((), scene.hands.mask, scene.hands.provider), scene.fit, scene.geometry)
+    assert not reference.contact.any()
+    assert "no hand was seen" in reference.notes[0]
+
+
+def test_the_hand_that_moves_with_the_part_is_chosen() -> None:
+    scene = make_scene("drawer")
+    right = scene.hands.tracks[0]
+    still = replace(held_still(right, 20), side="left")
+    drive = find_drive(Hands((still, right), scene.hands.mask, scene.hands.provider), scene.fit, scene.video.time)
+    assert drive.index == 1
+
+
+def test_scale_comes_from_the_hand_within_its_stated_error() -> None:
+    errors = []
+    for name, seed in (("demo", 0), ("laptop", 0), ("drawer", 0), ("oven", 1)):
+        scene = make_scene(name, seed, hand_size=1.0, drift=0.05)
+        unit = replace(rescale(scene.fit, 1 / 0.7, 0.0, "none"), metric=False)
+        metric = hand_scale(unit, scene.hands, scene.video.time)
+        assert metric.metric and metric.scale_source == "hand"
+        factor = np.linalg.norm(metric.T_camera_world[:3, 3]) / np.linalg.norm(unit.T_camera_world[:3, 3])
+        errors.append(np.log(factor / 0.7) / metric.std["scale"])
+        # The picture is the same.
+        np.testing.assert_allclose(metric.project(metric.points), unit.project(unit.points), atol=1e-6)
+    assert np.abs(errors).max() < 2.0
+    nobody = hand_scale(unit, Hands((), scene.hands.mask, scene.hands.provider), scene.video.time)
+    assert not nobody.metric and nobody.scale_source == "none"
+    np.testing.assert_array_equal(nobody.points, unit.points)
+
+
+def test_position_from_one_view() -> None:
+    scene = make_scene("laptop", hand_size=1.0, drift=0.0, pixel_noise=0.5)
+    camera, std = hand_positions(scene.hands.tracks[0], scene.fit.K)
+    T = scene.fit.T_camera_world
+    true = scene.joints @ T[:3, :3].T + T[:3, 3]
+    valid = scene.hands.tracks[0].valid
+    assert np.isnan(camera[~valid]).all() and np.isnan(std[~valid]).all()
+    depth, wanted = camera[valid][..., 2].mean(1), true[valid][..., 2].mean(1)
+    assert np.median(np.abs(depth / wanted - 1)) < 0.06
+    assert (std[valid] >= 0.119 * depth).all()
+
+
+def test_one_anatomy_keeps_directions() -> None:
+    rng = np.random.default_rng(0)
+    joints = rng.normal(0, 0.05, (6, 21, 3))
+    joints[2] = np.nan
+    out = one_anatomy(joints, np.ones(6))
+    assert np.isnan(out[2]).all()
+    seen = np.delete(out, 2, axis=0)
+    np.testing.assert_allclose(bone_lengths(seen), np.broadcast_to(bone_lengths(seen)[0], (5, 21)), atol=1e-9)
+
+
+@pytest.mark.parametrize("target", [(0.03, 0.02, 0.0), (0.5, 0.0, 0.0)])
+def test_reach_keeps_bones(target: tuple[float, ...]) -> None:
+    chain = np.array([[0, 0, 0], [0.04, 0, 0], [0.065, 0.005, 0], [0.08, 0.012, 0]])
+    bent = reach(chain, np.array(target))
+    np.testing.assert_allclose(np.linalg.norm(np.diff(bent, axis=0), axis=1),
+                               np.linalg.norm(np.diff(chain, axis=0), axis=1), atol=1e-6)  # fmt: skip
+    np.testing.assert_array_equal(bent[0], chain[0])
+    if np.linalg.norm(target) < 0.08:
+        np.testing.assert_allclose(bent[-1], target, atol=1e-3)
+
+
+def test_distance_to_a_box() -> None:
+    shape = LinkShape(make_scene("drawer").geometry.moving)
+    assert (shape.distance(shape.points + 0.01 * shape.normals)[0] <= 0.0101).all()
+    np.testing.assert_allclose(shape.distance(shape.points)[0], 0.0, atol=1e-6)
+    assert shape.distance(shape.centre + [0.0, 0.0, 5.0])[0] > 4.0
+
+
+def test_runs_and_gaps() -> None:
+    flags = np.array([0, 1, 1, 0, 1, 0, 0, 0, 1], bool)
+    assert runs(flags) == [(1, 3), (4, 5), (8, 9)]
+    assert runs(close_gaps(flags, 1)) == [(1, 5), (8, 9)]
