@@ -1,0 +1,142 @@
+"""Convex parts, mass, and the proof that the two links stay clear of each other."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+
+import numpy as np
+
+from reconstruct.geometry.solids import hull, sweep_range, to_arrays
+from reconstruct.joint.models import JointFit
+
+Part = tuple[np.ndarray, np.ndarray]
+MAX_PARTS = 16
+DENSITY = 300.0
+"""kg/m3 of a household part taken as solid (hollow plastic, chipboard and sheet metal lie between 100 and 700)."""
+
+
+def convex_parts(vertices: np.ndarray, faces: np.ndarray, limit: int = MAX_PARTS,
+                 concavity: float = 0.05) -> tuple[tuple[Part, ...], dict]:
+    """Convex decomposition of a closed mesh.
+
+    Args:
+        vertices, faces: (V, 3), (F, 3).
+        limit: most parts.
+        concavity: CoACD's threshold (its own measure, relative to the mesh's size).
+
+    Returns:
+        The parts and {"parts", "concavity", "volume_error"}: the parts' summed volume over the mesh's, minus 1.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    volume = float(mesh.volume)
+    whole = hull(vertices)
+    if volume > 0.97 * whole.volume():
+        parts: tuple[Part, ...] = (to_arrays(whole),)
+    else:
+        import coacd
+
+        coacd.set_log_level("error")
+        with contextlib.redirect_stdout(io.StringIO()):
+            found = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=concavity, max_convex_hull=limit,
+                                    preprocess_mode="off", mcts_iterations=60, mcts_nodes=12, mcts_max_depth=2,
+                                    resolution=1000, seed=0)
+        parts = tuple(to_arrays(hull(v)) for v, _ in found if len(v) >= 4)
+        parts = tuple(p for p in parts if len(p[1]) >= 4)
+    total = sum(float(trimesh.Trimesh(v, f, process=False).volume) for v, f in parts)
+    return parts, {"parts": len(parts), "concavity": concavity, "volume_error": total / volume - 1 if volume else 0.0}
+
+
+def trim_parts(parts: tuple[Part, ...], clouds: list[np.ndarray]) -> tuple[Part, ...]:
+    """Cut every part back until it is outside the convex hull of every cloud.
+
+    A decomposition bridges small concavities, so that a part may reach into the volume that the solid
+    itself keeps free. Each cut is by one face plane of the obstacle, the one that loses the least.
+    """
+    from scipy.spatial import ConvexHull
+
+    obstacles = []
+    for cloud in clouds:
+        eq = ConvexHull(cloud).equations
+        obstacles.append((cloud.min(0), cloud.max(0), eq))
+    out = []
+    for vertices, _ in parts:
+        solid = hull(vertices)
+        first = solid.volume()
+        for low, high, eq in obstacles:
+            v, _ = to_arrays(solid)
+            if len(v) < 4 or (v.min(0) >= high).any() or (v.max(0) <= low).any():
+                continue
+            height = v @ eq[:, :3].T + eq[:, 3]
+            if (height.min(0) >= -1e-9).any():
+                continue
+            # The faces over which most of the part already lies are the candidates.
+            order = np.argsort(-height.mean(0))[:12]
+            cuts = [solid.trim_by_plane(eq[k, :3].tolist(), float(-eq[k, 3])) for k in order]
+            solid = max(cuts, key=lambda s: s.volume())
+            if solid.volume() < 0.01 * first:
+                break
+        if solid.volume() >= 0.01 * first:
+            v, _ = to_arrays(solid)
+            out.append(to_arrays(hull(v)))
+    return tuple(out)
+
+
+def contacts_over_range(moving: tuple[Part, ...], static: tuple[Part, ...], fit: JointFit,
+                        states: int = 41) -> dict:
+    """MuJoCo's own verdict: contacts between the links' convex parts over the joint's range.
+
+    Returns:
+        {"states", "contacts", "penetration"}: number of states, of contacts in them, and the deepest overlap.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    # Meshes may be in any unit: keep MuJoCo's lower bounds on inertia out of the way.
+    spec.compiler.boundmass = 1e-6
+    spec.compiler.boundinertia = 1e-9
+    size = max(float(np.abs(np.vstack([v for v, _ in moving + static])).max()), 1e-9)
+    bodies = {}
+    for name, parts in (("moving", moving), ("static", static)):
+        body = spec.worldbody.add_body(name=name, mocap=True)
+        for k, (v, f) in enumerate(parts):
+            mesh = spec.add_mesh(name=f"{name}{k}")
+            mesh.uservert = (v / size).astype(np.float32).ravel()
+            mesh.userface = f.astype(np.int32).ravel()
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{name}{k}")
+        bodies[name] = body
+    # Two mocap bodies are both welded to the world, which MuJoCo never collides: let one float.
+    bodies["moving"].mocap = False
+    bodies["moving"].add_freejoint()
+    model = spec.compile()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    data = mujoco.MjData(model)
+    count, depth = 0, 0.0
+    quat = np.zeros(4)
+    for T in fit.link_pose(np.linspace(*sweep_range(fit), states)):
+        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(T[:3, :3]).ravel())
+        data.qpos[:3] = T[:3, 3] / size
+        data.qpos[3:] = quat
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        for c in data.contact[: data.ncon]:
+            ends = {int(model.geom_bodyid[c.geom1]), int(model.geom_bodyid[c.geom2])}
+            if len(ends) == 2:
+                count += 1
+                depth = max(depth, -float(c.dist) * size)
+    return {"states": states, "contacts": count, "penetration": depth}
+
+
+def mass_properties(vertices: np.ndarray, faces: np.ndarray, density: float = DENSITY) -> dict:
+    """{"mass" kg, "com" (3,) m, "inertia" (3, 3) kg m2 about it, world axes, "density"} of a solid of one density."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.density = density
+    return {"mass": float(mesh.mass), "com": np.asarray(mesh.center_mass), "inertia": np.asarray(mesh.moment_inertia),
+            "density": density}

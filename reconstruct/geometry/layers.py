@@ -1,0 +1,319 @@
+"""Which cells of the link's plane belong to the link: two motions compete for every pixel.
+
+The camera is still and the joint is known, so a pixel that the link covers must look like the same
+cell of the link in frames at other q, and a pixel of the rest must look like itself in frames in
+which the link is elsewhere. Comparing the two, frame by frame and cell by cell, needs no model of
+what a link looks like; summing over frames in the link's own chart lets frames in which a hand hides
+a piece be filled by frames in which it does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruct.cues import Hands
+from reconstruct.geometry.plane import LinkPlane, apply_homography, homography, working_matrix
+from reconstruct.joint.models import JointFit
+from reconstruct.video import Video
+
+LONG_SIDE = 400
+"""Evidence is gathered on frames of this long side, px."""
+GRID = 180
+"""Cells along the longer side of the chart."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A grid on the link's plane. origin: (2,) plane coordinates of cell (0, 0); cell: its size; shape (rows, cols)."""
+
+    origin: np.ndarray
+    cell: float
+    shape: tuple[int, int]
+
+    def centres(self) -> np.ndarray:
+        """(rows, cols, 2) plane coordinates; a row is a step in v, a column a step in u."""
+        r, c = np.mgrid[: self.shape[0], : self.shape[1]]
+        return self.origin + self.cell * np.stack([c, r], -1)
+
+    def to_plane_matrix(self) -> np.ndarray:
+        """(3, 3) (column, row, 1) -> plane (u, v, 1)."""
+        return np.array([[self.cell, 0, self.origin[0]], [0, self.cell, self.origin[1]], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the frames say about the chart's cells.
+
+    Attributes:
+        chart: the grid.
+        occupied: (rows, cols) bool, the link.
+        score: (rows, cols) mean log-odds-like evidence, positive for the link; 0 unknown.
+        seen: (rows, cols) number of frames that had a say.
+        frames: (F,) working frames looked at.
+    """
+
+    chart: Chart
+    occupied: np.ndarray
+    score: np.ndarray
+    seen: np.ndarray
+    frames: np.ndarray
+
+
+def spread_frames(fit: JointFit, hand_mask: np.ndarray, count: int) -> np.ndarray:
+    """Up to ``count`` frames evenly spread over q; of the frames of one bin the one with the fewest hand pixels."""
+    q = np.asarray(fit.q, float)
+    covered = hand_mask[:, ::4, ::4].reshape(len(q), -1).mean(1)
+    edges = np.linspace(q.min(), q.max(), count + 1)
+    which = np.clip(np.searchsorted(edges, q, side="right") - 1, 0, count - 1)
+    picks = []
+    for b in range(count):
+        members = np.flatnonzero(which == b)
+        if len(members):
+            middle = np.abs(q[members] - (edges[b] + edges[b + 1]) / 2) / max(edges[1] - edges[0], 1e-12)
+            picks.append(members[np.argmin(covered[members] * 10 + middle)])
+    return np.asarray(sorted(set(int(p) for p in picks)))
+
+
+def seed_polygon(fit: JointFit, plane: LinkPlane) -> np.ndarray:
+    """(k, 2) convex outline, plane coordinates, of what surely belongs to the link: its points and, for a
+    hinged link, the stretch of the axis beside them (a link reaches its hinge)."""
+    from shapely.geometry import MultiPoint
+
+    flat = plane.to_plane(fit.points)[plane.inlier][:, :2]
+    low, high = np.quantile(flat, [0.02, 0.98], axis=0)
+    margin = 0.05 * (high - low).max()
+    flat = flat[((flat >= low - margin) & (flat <= high + margin)).all(1)]
+    hinge = np.empty((0, 2))
+    if fit.type != "prismatic":
+        foot = plane.to_plane(fit.point)
+        if plane.kind == "across the axis":
+            hinge = foot[None, :2]
+        else:
+            # The axis runs (nearly) along u at height foot[2] over the plane; far off the plane there is no reach.
+            reach = np.linalg.norm(np.ptp(flat, axis=0))
+            if abs(foot[2]) < 0.5 * reach:
+                hinge = np.array([[flat[:, 0].min(), foot[1]], [flat[:, 0].max(), foot[1]]])
+    hull = MultiPoint(np.vstack([flat, hinge])).buffer(0.02 * plane.extent).convex_hull
+    return np.asarray(hull.exterior.coords)[:-1]
+
+
+def make_chart(seed: np.ndarray, grow: float = 0.6, grid: int = GRID) -> Chart:
+    """A grid around the seed, larger by ``grow`` of its size on every side."""
+    low, high = seed.min(0), seed.max(0)
+    pad = grow * np.maximum(high - low, 0.5 * (high - low).max())
+    low, high = low - pad, high + pad
+    cell = float((high - low).max() / grid)
+    cols, rows = np.ceil((high - low) / cell).astype(int)
+    return Chart(low, cell, (int(rows), int(cols)))
+
+
+def fill(chart: Chart, polygon: np.ndarray) -> np.ndarray:
+    """Polygon in plane coordinates -> (rows, cols) bool."""
+    import cv2
+
+    out = np.zeros(chart.shape, np.uint8)
+    cv2.fillPoly(out, [np.round((polygon - chart.origin) / chart.cell).astype(np.int32)], 1)
+    return out > 0
+
+
+def warp_to_image(chart: Chart, cells: np.ndarray, H: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Chart mask -> image mask; H maps plane coordinates to px of an image of (width, height) ``size``."""
+    import cv2
+
+    M = H @ chart.to_plane_matrix()
+    # Keep the scale tame for OpenCV, whose fixed-point warps dislike tiny numbers.
+    M = M / np.linalg.norm(M)
+    return cv2.warpPerspective(cells.astype(np.uint8) * 255, M, size, flags=cv2.INTER_LINEAR) > 127
+
+
+def small_frame(video: Video, t: int, scale: float) -> np.ndarray:
+    """(h, w, 3) uint8 BGR working frame shrunk by ``scale``."""
+    import cv2
+
+    image = np.asarray(video.frames[t])
+    if scale < 1:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return image
+
+
+def to_lab(image: np.ndarray) -> np.ndarray:
+    """(h, w, 3) float32 slightly blurred Lab in which distances between frames are measured."""
+    import cv2
+
+    lab = cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 0.8), cv2.COLOR_BGR2LAB).astype(np.float32)
+    # Brightness changes with shading and shadows far more than hue does.
+    lab[..., 0] *= 0.6
+    return lab
+
+
+def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: int = 24,
+           rounds: int = 2) -> Evidence:
+    """Which cells of the link's plane are link.
+
+    Args:
+        video: stabilised, static camera.
+        hands: their pixels count as unknown.
+        fit: the joint.
+        plane: from :func:`reconstruct.geometry.plane.fit_plane`.
+        count: frames to look at.
+        rounds: times that the background is learned anew with the link's better outline excluded.
+    """
+    import cv2
+
+    h, w = video.frames.shape[1:3]
+    scale = min(1.0, LONG_SIDE / max(h, w))
+    S = working_matrix(video, scale)
+    frames = spread_frames(fit, hands.mask, count)
+    seed_outline = seed_polygon(fit, plane)
+    chart = make_chart(seed_outline)
+    seed = fill(chart, seed_outline)
+    small = [small_frame(video, t, scale) for t in frames]
+    images = np.stack([to_lab(f) for f in small])
+    size = (images.shape[2], images.shape[1])
+    hand = np.stack([cv2.dilate(cv2.resize(hands.mask[t].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST),
+                                np.ones((5, 5), np.uint8)) > 0 for t in frames])
+    H = S @ homography(fit, plane, fit.q[frames])
+    centres = chart.centres()
+    uv = np.stack([apply_homography(h_t, centres) for h_t in H])
+    inside = np.isfinite(uv).all(-1) & (uv > 1).all(-1) & (uv < np.array(size) - 2).all(-1)
+    uvf = np.nan_to_num(uv).astype(np.float32)
+
+    def sample(image: np.ndarray, k: int) -> np.ndarray:
+        return cv2.remap(image, uvf[k, ..., 0], uvf[k, ..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    usable = inside & ~np.stack([sample(m.astype(np.uint8), k) > 0 for k, m in enumerate(hand)])
+    warped = np.stack([sample(images[k], k) for k in range(len(frames))])
+    noise = _noise(video, hands, scale, frames)
+    facing = np.sign(plane.facing[frames])
+    link_miss = _link_residual(warped, usable, uv, facing, fit.q[frames])
+    occupied = seed
+    score = np.zeros(chart.shape)
+    seen = np.zeros(chart.shape, int)
+    weight = np.abs(plane.facing[frames])[:, None, None]
+    for _ in range(rounds):
+        grown = cv2.dilate(occupied.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        covered = np.stack([warp_to_image(chart, grown, H[k], size) for k in range(len(frames))])
+        back_miss = np.stack([sample(b, k) for k, b in enumerate(background_residual(images, covered | hand))])
+        known = usable & (back_miss >= 0) & np.isfinite(link_miss)
+        ratio = np.clip((back_miss - link_miss) / (2 * noise), -3, 3)
+        votes = np.where(known, weight * ratio, 0.0)
+        total = (weight * known).sum(0)
+        score = votes.sum(0) / np.maximum(total, 1e-9)
+        seen = known.sum(0)
+        score = np.where(seen >= 2, score, 0.0)
+        occupied = _smooth(score, seen, seed, warped, usable)
+    return Evidence(chart, occupied, score, seen, frames)
+
+
+def _noise(video: Video, hands: Hands, scale: float, frames: np.ndarray) -> float:
+    """Typical difference of one unmoved pixel between two frames, in the units of :func:`to_lab`."""
+    if len(frames) < 2:
+        return 4.0
+    late = [min(int(t) + 1, len(video) - 1) for t in frames[:: max(1, len(frames) // 4)]]
+    pairs = [(to_lab(small_frame(video, t, scale)), to_lab(small_frame(video, t - 1, scale))) for t in late if t]
+    miss = [np.median(np.linalg.norm(a - b, axis=-1)) for a, b in pairs]
+    return float(np.clip(2.5 * np.median(miss), 3.0, 12.0)) if miss else 4.0
+
+
+def _link_residual(warped: np.ndarray, usable: np.ndarray, uv: np.ndarray, facing: np.ndarray,
+                   q: np.ndarray, neighbours: int = 5) -> np.ndarray:
+    """(F, rows, cols) how far a cell's colour in a frame is from its colour in frames at near, but different, q.
+
+    Near, because shading turns with the link; different, because where the cell stood still in the image
+    the comparison would hold for the background too. The median over neighbours forgives one occlusion.
+    """
+    F = len(warped)
+    out = np.full(usable.shape, np.inf, np.float32)
+    for k in range(F):
+        mates = [j for j in np.argsort(np.abs(q - q[k]), kind="stable") if j != k and facing[j] == facing[k]]
+        stack = []
+        for j in mates[:neighbours]:
+            moved = np.linalg.norm(uv[k] - uv[j], axis=-1) > 2.0
+            d = np.linalg.norm(warped[k] - warped[j], axis=-1)
+            stack.append(np.where(usable[k] & usable[j] & moved, d, np.nan))
+        if stack:
+            stack = np.stack(stack)
+            enough = np.isfinite(stack).sum(0) >= min(2, len(stack))
+            # A sort puts NaN last; the lower median of what is left.
+            stack.sort(axis=0)
+            middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
+            out[k] = np.where(enough, np.take_along_axis(stack, middle[None], 0)[0], np.inf)
+    return out
+
+
+def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """How far each pixel is from its own colours in the frames in which nothing covers it.
+
+    Args:
+        images: (F, h, w, 3) from :func:`to_lab`.
+        covered: (F, h, w) bool, link or hand.
+
+    Returns:
+        (F, h, w), -1 where fewer than two other frames show the background. The lower quartile, so that a
+        passing reflection does not count against it; a pixel that only grew darker by a shadow's amount,
+        its colour kept, counts for less.
+    """
+    F = len(images)
+    out = np.full(covered.shape, -1, np.float32)
+    free = ~covered
+    for k in range(F):
+        diff = images - images[k]
+        light, colour = diff[..., 0], np.square(diff[..., 1:]).sum(-1)
+        # Darker here than there by up to a half, hue unchanged: a shadow explains it.
+        shade = (light > 0) & (light < 0.5 * images[..., 0]) & (colour < 16 + 0.02 * np.square(light))
+        d = np.sqrt(np.square(np.where(shade, 0.35, 1.0) * light) + colour)
+        d = np.where(free, d, np.inf)
+        d[k] = np.inf
+        d.sort(axis=0)
+        count = np.isfinite(d).sum(0)
+        pick = np.clip((count - 1) // 4, 0, F - 1)
+        value = np.take_along_axis(d, pick[None], 0)[0]
+        out[k] = np.where(count >= 2, value, -1)
+    return out
+
+
+def _smooth(score: np.ndarray, seen: np.ndarray, seed: np.ndarray, warped: np.ndarray,
+            usable: np.ndarray) -> np.ndarray:
+    """Labels from votes: a quadratic field that follows the votes where there are some, and elsewhere spreads
+    from its neighbours except across edges of the link's own texture."""
+    import cv2
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import cg
+
+    rows, cols = score.shape
+    texture = np.where(usable[..., None], warped, 0).sum(0) / np.maximum(usable.sum(0), 1)[..., None]
+    trust = np.clip(seen / 6.0, 0, 1)
+    target = np.clip(score, -1.5, 1.5)
+    # Without votes: the seed is link by construction, the rim of the chart is not.
+    pull = trust + 0.02
+    target = (trust * target + 0.02 * np.where(seed, 1.0, -0.5)) / pull
+    index = np.arange(rows * cols).reshape(rows, cols)
+    i, j, wgt = [], [], []
+    for a, b, d in ((index[:, :-1], index[:, 1:], np.diff(texture, axis=1)),
+                    (index[:-1], index[1:], np.diff(texture, axis=0))):
+        i.append(a.ravel())
+        j.append(b.ravel())
+        wgt.append((0.5 + 4.0 * np.exp(-((np.linalg.norm(d, axis=-1) / 6.0) ** 2))).ravel())
+    i, j, wgt = np.concatenate(i), np.concatenate(j), np.concatenate(wgt)
+    n = rows * cols
+    degree = np.bincount(i, wgt, n) + np.bincount(j, wgt, n)
+    A = coo_matrix((np.r_[-wgt, -wgt, degree + pull.ravel()], (np.r_[i, j, np.arange(n)], np.r_[j, i, np.arange(n)])))
+    x, _ = cg(A.tocsr(), (pull * target).ravel(), x0=target.ravel(), rtol=1e-4, maxiter=300)
+    mask = (x.reshape(rows, cols) > 0).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, labels = cv2.connectedComponents(mask)
+    shares = np.bincount(labels[seed], minlength=labels.max() + 1)
+    shares[0] = 0
+    if not shares.any():
+        return seed
+    keep = np.isin(labels, np.flatnonzero(shares >= 0.1 * shares.max()))
+    holes = 1 - keep.astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(holes)
+    for k in range(1, len(stats)):
+        inner = stats[k, 0] > 0 and stats[k, 1] > 0 and stats[k, 0] + stats[k, 2] < cols \
+            and stats[k, 1] + stats[k, 3] < rows
+        if inner and stats[k, 4] < 0.03 * keep.sum():
+            keep |= labels == k
+    return keep

@@ -1,0 +1,165 @@
+"""The moving link's silhouette in every frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reconstruct.cues import Hands, LinkMasks, Tracks
+from reconstruct.geometry.layers import (
+    LONG_SIDE,
+    Evidence,
+    background_residual,
+    gather,
+    small_frame,
+    spread_frames,
+    to_lab,
+    warp_to_image,
+)
+from reconstruct.geometry.plane import LinkPlane, fit_plane, homography, working_matrix
+from reconstruct.joint.models import JointFit
+from reconstruct.video import Video
+
+KEY_FRAMES = 16
+"""Frames whose silhouette is cut at pixel level; the others take the nearest one's, moved with the joint."""
+
+
+def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> LinkMasks:
+    """Silhouettes of the moving link, and what of the static scene can be seen.
+
+    The outline in the link's own plane comes from :func:`reconstruct.geometry.layers.gather`. In each key
+    frame GrabCut turns it into pixels: seeds are the outline's inside and the projected track points;
+    background is what looks as it does when the link is elsewhere; a rim that does not look so may be
+    link (its thickness, what sticks out of the plane). Hand pixels are left out of both.
+
+    Args:
+        video: stabilised, static camera.
+        hands: hand pixels.
+        tracks: all tracks.
+        fit: the joint with its points and q.
+
+    Returns:
+        Masks at working size. ``confidence`` is the agreement (intersection over union) of the pixels cut
+        in the nearest key frame with the outline projected from the evidence of all frames.
+    """
+    import cv2
+
+    T, h, w = video.frames.shape[:3]
+    plane = fit_plane(tracks, fit)
+    evidence = gather(video, hands, fit, plane)
+    scale = min(1.0, LONG_SIDE / max(h, w))
+    keys = spread_frames(fit, hands.mask, KEY_FRAMES)
+    cut, agreement = _cut_keys(video, hands, fit, plane, evidence, keys, scale)
+
+    S = working_matrix(video)
+    to_full = np.linalg.inv(S)
+    H = homography(fit, plane, fit.q)
+    moving = np.zeros((T, h, w), bool)
+    confidence = np.zeros(T)
+    q_span = max(float(np.ptp(fit.q)), 1e-12)
+    side = np.sign(plane.facing)
+    sized = {k: cv2.resize(m.astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_LINEAR) > 127
+             for k, m in zip(keys, cut, strict=True)}
+    for t in range(T):
+        # A key that shows the other side of the link is a poor model of this frame even if q is near.
+        cost = np.abs(fit.q[keys] - fit.q[t]) / q_span + 0.5 * (side[keys] != side[t])
+        n = int(np.argmin(cost))
+        k = int(keys[n])
+        moved = S @ H[t] @ np.linalg.inv(H[k]) @ to_full
+        shift = _largest_shift(moved, sized[k])
+        if shift < 0.7:
+            mask = sized[k].copy()
+        else:
+            mask = cv2.warpPerspective(sized[k].astype(np.uint8) * 255, moved / moved[2, 2], (w, h),
+                                       flags=cv2.INTER_LINEAR) > 127
+        moving[t] = mask & ~hands.mask[t]
+        confidence[t] = agreement[n] * float(np.exp(-((cost[n] / 0.15) ** 2)))
+    static = ~moving & ~hands.mask
+    return LinkMasks(moving, static, hands.mask.copy(), confidence)
+
+
+def _largest_shift(M: np.ndarray, mask: np.ndarray) -> float:
+    """How far, px, the homography moves the corners of a mask's bounding box."""
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return 0.0
+    box = np.array([[c, r, 1.0] for c in (cols[0], cols[-1]) for r in (rows[0], rows[-1])])
+    x = box @ M.T
+    return float(np.abs(x[:, :2] / x[:, 2:] - box[:, :2]).max())
+
+
+def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evidence: Evidence, keys: np.ndarray,
+              scale: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """GrabCut in the key frames: masks at reduced size and their agreement with the projected outline."""
+    import cv2
+
+    small = [small_frame(video, t, scale) for t in keys]
+    size = (small[0].shape[1], small[0].shape[0])
+    hand = np.stack([cv2.resize(hands.mask[t].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+                     for t in keys])
+    S = working_matrix(video, scale)
+    outline = np.stack([warp_to_image(evidence.chart, evidence.occupied, S @ h_t, size)
+                        for h_t in homography(fit, plane, fit.q[keys])])
+    reach = max(3, int(0.12 * np.sqrt(max(outline.sum((1, 2)).max(), 1))))
+    wide = np.stack([cv2.dilate(m.astype(np.uint8), _disc(reach)) > 0 for m in outline])
+    images = np.stack([to_lab(f) for f in small])
+    # Frames of the cut and of the evidence share the noise level; the residual decides "changed" against it.
+    change = background_residual(images, wide | hand)
+    quiet = change[(change >= 0) & ~wide & ~hand]
+    noise = float(np.clip(np.quantile(quiet, 0.9), 4.0, 14.0)) if len(quiet) else 8.0
+    points = (fit.link_pose(fit.q[keys])[:, None, :3, :3] @ fit.points[plane.inlier][None, :, :, None])[..., 0]
+    points = points + fit.link_pose(fit.q[keys])[:, None, :3, 3]
+    masks, agreement = [], np.zeros(len(keys))
+    for n in range(len(keys)):
+        seeds = np.zeros(outline[n].shape, np.uint8)
+        uv = video.to_work(fit.project(points[n])) * scale
+        for u, v in uv[np.isfinite(uv).all(-1)]:
+            cv2.circle(seeds, (int(np.clip(u, -10, 9999)), int(np.clip(v, -10, 9999))), 1, 1, -1)
+        mask = _cut(small[n], outline[n], wide[n], hand[n], change[n], noise, seeds > 0, max(2, reach // 2))
+        both = (mask & outline[n] & ~hand[n]).sum()
+        either = ((mask | outline[n]) & ~hand[n]).sum()
+        agreement[n] = both / max(either, 1)
+        # What the hand hides here may show where this mask is carried to: the outline knows it from other frames.
+        masks.append(mask | (outline[n] & cv2.dilate(hand[n].astype(np.uint8), _disc(2)).astype(bool)))
+    return masks, agreement
+
+
+def _disc(radius: int) -> np.ndarray:
+    import cv2
+
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+
+
+def _cut(image: np.ndarray, outline: np.ndarray, wide: np.ndarray, hand: np.ndarray, change: np.ndarray,
+         noise: float, seeds: np.ndarray, core: int) -> np.ndarray:
+    """One frame's silhouette; the projected outline itself where a cut is not possible or runs away."""
+    import cv2
+
+    inner = cv2.erode(outline.astype(np.uint8), _disc(core)) > 0
+    known = change >= 0
+    still = known & (change < noise)
+    trimap = np.full(outline.shape, cv2.GC_BGD, np.uint8)
+    trimap[wide] = cv2.GC_PR_BGD
+    trimap[wide & known & (change > 2.5 * noise)] = cv2.GC_PR_FGD
+    trimap[outline] = cv2.GC_PR_FGD
+    trimap[wide & still & ~outline] = cv2.GC_BGD
+    trimap[(inner & ~still) | (seeds & outline)] = cv2.GC_FGD
+    trimap[hand] = cv2.GC_BGD
+    box = np.argwhere(wide)
+    if len(box) < 20 or not (trimap == cv2.GC_FGD).any() or not (trimap[wide] == cv2.GC_BGD).any():
+        return outline & ~hand
+    (r0, c0), (r1, c1) = np.maximum(box.min(0) - 15, 0), box.max(0) + 16
+    part = trimap[r0:r1, c0:c1].copy()
+    cv2.setRNGSeed(0)
+    try:
+        cv2.grabCut(image[r0:r1, c0:c1].copy(), part, None, np.zeros((1, 65)), np.zeros((1, 65)), 4,
+                    cv2.GC_INIT_WITH_MASK)
+    except cv2.error:
+        return outline & ~hand
+    mask = np.zeros(outline.shape, np.uint8)
+    mask[r0:r1, c0:c1] = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, labels = cv2.connectedComponents(mask)
+    touch = np.unique(labels[inner & (mask > 0)])
+    mask = np.isin(labels, touch[touch > 0])
+    overlap = (mask & outline & ~hand).sum() / max(((mask | outline) & ~hand).sum(), 1)
+    return mask if overlap > 0.55 else outline & ~hand

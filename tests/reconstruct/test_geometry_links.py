@@ -1,0 +1,158 @@
+"""Masks, meshes and their clearance on a drawn slab whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from reconstruct.errors import TaaError
+from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
+from reconstruct.geometry.links import build_geometry
+from reconstruct.geometry.masks import segment_links
+from reconstruct.geometry.plane import fit_plane
+from reconstruct.geometry.solids import hull, swept_hulls, to_arrays
+from tests.reconstruct.geometry_scenes import make_scene
+
+
+@pytest.fixture(scope="module")
+def door():
+    scene = make_scene("revolute")
+    return scene, segment_links(scene.video, scene.hands, scene.tracks, scene.fit)
+
+
+@pytest.fixture(scope="module")
+def door_geometry(door):
+    scene, masks = door
+    return build_geometry(scene.video, scene.hands, scene.tracks, scene.fit, masks)
+
+
+def _iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+def _box(low, high):
+    v = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])], float)
+    return to_arrays(hull(v))
+
+
+def test_the_plane_is_the_doors_and_holds_the_axis(door):
+    scene, _ = door
+    plane = fit_plane(scene.tracks, scene.fit)
+    assert plane.kind == "holds the axis"
+    assert abs(plane.pose[1, 2]) > np.cos(np.radians(4))
+    assert plane.inlier.mean() > 0.8
+
+
+def test_masks_follow_the_link_and_leave_out_the_hand(door):
+    scene, masks = door
+    ious = [_iou(masks.moving[t], scene.masks[t]) for t in range(len(scene.video))]
+    # Edge-on, the slab's rim is most of it, and a few pixels decide.
+    frontal = np.abs(fit_plane(scene.tracks, scene.fit).facing) > 0.35
+    assert np.mean(ious) > 0.9 and np.min(np.array(ious)[frontal]) > 0.85
+    assert not (masks.moving & masks.hand).any()
+    assert not (masks.moving & masks.static).any()
+    assert masks.confidence.shape == (len(scene.video),) and (masks.confidence <= 1).all()
+
+
+def test_the_moving_mesh_is_the_slab(door, door_geometry):
+    scene, _ = door
+    mesh = trimesh.Trimesh(door_geometry.moving.vertices, door_geometry.moving.faces, process=False)
+    assert mesh.is_watertight and mesh.volume > 0
+    size = np.linalg.norm(scene.high - scene.low)
+    low, high = mesh.bounds
+    assert np.abs(low - scene.low).max() < 0.06 * size
+    assert np.abs(high - scene.high).max() < 0.06 * size
+
+
+def test_both_links_are_closed_and_coloured(door_geometry):
+    for link in (door_geometry.moving, door_geometry.static):
+        mesh = trimesh.Trimesh(link.vertices, link.faces, process=False)
+        assert mesh.is_watertight
+        assert link.colors.shape == (len(link.vertices), 4) and link.colors.dtype == np.uint8
+        assert link.assumed.shape == (len(link.faces),)
+        assert 1 <= len(link.parts) <= 16
+    assert door_geometry.static.assumed.all()
+    assert not door_geometry.moving.assumed.all()
+
+
+def test_the_front_has_the_videos_colour(door_geometry):
+    seen = ~door_geometry.moving.assumed
+    rgb = door_geometry.moving.colors[door_geometry.moving.faces[seen]][..., :3].mean((0, 1))
+    assert rgb[0] > rgb[1] > rgb[2]
+
+
+def test_links_stay_clear_over_the_range(door, door_geometry):
+    assert door_geometry.provenance["contacts_over_range"]["value"] == 0
+    scene, _ = door
+    again = contacts_over_range(door_geometry.moving.parts, door_geometry.static.parts, scene.fit, states=60)
+    assert again["contacts"] == 0
+
+
+def test_every_number_says_where_it_comes_from(door_geometry):
+    for entry in door_geometry.provenance.values():
+        assert entry["origin"] in ("observed", "fitted", "assumed", "given")
+
+
+def test_an_overlap_is_seen_and_trimmed_away(door):
+    scene, _ = door
+    moving = (_box(scene.low, scene.high),)
+    blocked = (_box([0.1, -0.2, 0.05], [0.2, -0.1, 0.2]), _box([-0.3, 0.05, 0.0], [0.3, 0.1, 0.2]))
+    bad = contacts_over_range(moving, blocked, scene.fit)
+    assert bad["contacts"] > 0 and bad["penetration"] > 0
+    kept = trim_parts(blocked, swept_hulls(moving, scene.fit, 0.004))
+    assert contacts_over_range(moving, kept, scene.fit)["contacts"] == 0
+    assert len(kept) >= 1
+
+
+def test_static_keeps_out_of_the_hands_way(door, door_geometry):
+    scene, masks = door
+    middle = door_geometry.static.vertices.mean(0)
+    cloud = middle + np.random.default_rng(0).normal(size=(6, 21, 3)) * 0.02
+    made = build_geometry(scene.video, scene.hands, scene.tracks, scene.fit, masks, hand_points=cloud)
+    for vertices, faces in made.static.parts:
+        inside = trimesh.Trimesh(vertices, faces, process=False).contains(cloud.reshape(-1, 3))
+        assert not inside.any()
+
+
+def test_a_slide_in_another_unit():
+    scene = make_scene("prismatic", unit=37.0)
+    masks = segment_links(scene.video, scene.hands, scene.tracks, scene.fit)
+    made = build_geometry(scene.video, scene.hands, scene.tracks, scene.fit, masks)
+    size = np.linalg.norm(scene.high - scene.low)
+    span = np.ptp(made.moving.vertices, axis=0)
+    assert abs(span[0] - 0.4 * 37) < 0.1 * size and abs(span[2] - 0.3 * 37) < 0.1 * size
+    assert made.provenance["contacts_over_range"]["value"] == 0
+
+
+def test_same_input_same_mesh(door, door_geometry):
+    scene, masks = door
+    again = build_geometry(scene.video, scene.hands, scene.tracks, scene.fit, masks)
+    assert np.array_equal(again.moving.vertices, door_geometry.moving.vertices)
+    assert np.array_equal(again.static.vertices, door_geometry.static.vertices)
+
+
+def test_no_silhouette_is_refused(door):
+    scene, masks = door
+    with pytest.raises(TaaError, match="silhouette"):
+        build_geometry(scene.video, scene.hands, scene.tracks, scene.fit,
+                       replace(masks, moving=np.zeros_like(masks.moving)))
+
+
+def test_convex_parts_of_an_angle_iron():
+    a, b = _box([0, 0, 0], [1, 0.1, 0.1]), _box([0, 0, 0], [0.1, 1, 0.1])
+    solid = hull(a[0]) + hull(b[0])
+    parts, report = convex_parts(*to_arrays(solid))
+    assert 2 <= len(parts) <= 4
+    assert abs(report["volume_error"]) < 0.1
+    whole, report = convex_parts(*a)
+    assert len(whole) == 1 and abs(report["volume_error"]) < 1e-6
+
+
+def test_mass_of_a_box():
+    out = mass_properties(*_box([0, 0, 0], [0.2, 0.1, 0.05]), density=500)
+    assert out["mass"] == pytest.approx(0.5)
+    assert np.allclose(out["com"], [0.1, 0.05, 0.025])
+    assert out["inertia"][2, 2] == pytest.approx(0.5 / 12 * (0.2**2 + 0.1**2))
