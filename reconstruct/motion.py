@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -99,12 +99,71 @@ def stabilise(video: Video, scratch: Path | None = None, seed: int = 0) -> tuple
     where.mkdir(parents=True, exist_ok=True)
     out = np.lib.format.open_memmap(where / "frames_stable.npy", mode="w+", dtype=np.uint8, shape=video.frames.shape)
     for t in range(T):
-        out[t] = cv2.warpPerspective(
-            video.frames[t], motion.H[t], (w, h), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        out[t] = _warp(video.frames[t], motion.H[t])
+    # The dominant plane may be far behind the object. A second, affine correction follows the static points
+    # around the place where things happen, which is where the joint is.
+    local = _local_correction(out, video.diagonal * video.scale)
+    H = local @ motion.H
+    for t in range(T):
+        out[t] = _warp(video.frames[t], H[t])
+    motion = replace(motion, H=H)
     out.flush()
     note = f"camera drifts by up to {motion.drift_px.max() / video.scale:.1f} px; compensated by homographies"
     return video.with_frames(out, note), motion
+
+
+def _warp(image: np.ndarray, H: np.ndarray) -> np.ndarray:
+    import cv2
+
+    size = (image.shape[1], image.shape[0])
+    return cv2.warpPerspective(image, H, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _local_correction(frames: np.ndarray, diagonal: float) -> np.ndarray:
+    """(T, 3, 3) affine corrections from nearly static points, weighted by closeness to the picture's activity."""
+    import cv2
+
+    T = len(frames)
+    small = [cv2.resize(f, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.int16) for f in frames]
+    energy = sum(np.clip(np.abs(b - a).max(axis=-1) - 24, 0, 60) for a, b in zip(small[:-1], small[1:], strict=True))
+    energy = cv2.GaussianBlur(energy.astype(np.float32), (0, 0), 3)
+    yx = np.stack(np.nonzero(energy >= 0), axis=-1)
+    mass = energy.ravel() ** 2
+    centre = 4 * (yx * mass[:, None]).sum(0)[::-1] / (mass.sum() + 1e-9)
+
+    grey0 = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)
+    points = _grid_corners(grey0, per_cell=8)
+    where = np.full((T, len(points), 2), np.nan, np.float32)
+    where[0] = points[:, 0]
+    guess = points.copy()
+    lk = dict(winSize=(15, 15), maxLevel=2, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    for t in range(1, T):
+        grey = cv2.cvtColor(frames[t], cv2.COLOR_BGR2GRAY)
+        n, ok, _ = cv2.calcOpticalFlowPyrLK(grey0, grey, points, guess.copy(), **lk)
+        b, ok2, _ = cv2.calcOpticalFlowPyrLK(grey, grey0, n, points.copy(), **lk)
+        good = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(b - points, axis=-1).ravel() < 0.7)
+        good &= np.linalg.norm(n - points, axis=-1).ravel() < 0.02 * diagonal
+        where[t, good] = n[good, 0]
+        guess = np.where(good[:, None, None], n, points).astype(np.float32)
+    steady = np.isfinite(where[..., 0]).mean(0) > 0.7
+    out = np.tile(np.eye(3), (T, 1, 1))
+    if steady.sum() < 12:
+        return out
+    x, target = where[:, steady].astype(float), points[steady, 0].astype(float)
+    near = np.exp(-0.5 * (np.linalg.norm(target - centre, axis=-1) / (0.2 * diagonal)) ** 2) + 1e-3
+    for t in range(1, T):
+        seen = np.isfinite(x[t, :, 0])
+        a, b, w = np.c_[x[t, seen], np.ones(seen.sum())], target[seen], near[seen].copy()
+        M = None
+        for _ in range(6):
+            sw = np.sqrt(w)[:, None]
+            # A weak pull to the identity keeps the far corners of the image where they are.
+            ridge = np.diag([0.03 * diagonal] * 2 + [0.3])
+            M = np.linalg.lstsq(np.r_[a * sw, ridge], np.r_[b * sw, ridge @ np.eye(3)[:, :2]], rcond=None)[0]
+            r = np.linalg.norm(a @ M - b, axis=-1)
+            w = near[seen] / (1 + (r / 0.7) ** 2) ** 2
+        out[t, :2] = M.T
+    return out
 
 
 def _grid_corners(grey: np.ndarray, per_cell: int, cells: int = 10) -> np.ndarray:

@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 ANGLES = np.radians([15.0, 35.0, 60.0, 90.0, 120.0])
 
@@ -56,6 +55,13 @@ def perpendicular_basis(a: np.ndarray) -> np.ndarray:
     return np.stack([b1, np.cross(a, b1)], axis=-1)
 
 
+def _rotate(a: np.ndarray, angle: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, broadcasting: axes (..., 3), angles (...,), vectors (..., 3)."""
+    cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    along = np.sum(a * v, axis=-1, keepdims=True) * a
+    return along + cos * (v - along) + sin * np.cross(a, v)
+
+
 def _smallest_eigenvector_2x2(M: np.ndarray) -> np.ndarray:
     """(..., 2, 2) symmetric -> (..., 2) unit eigenvector of the smaller eigenvalue."""
     a, b, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 1]
@@ -64,19 +70,24 @@ def _smallest_eigenvector_2x2(M: np.ndarray) -> np.ndarray:
 
 
 def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarray, weight: np.ndarray, tol: float,
-                        rng: np.random.Generator, directions: int = 160, subsets: int = 40, keep: int = 6) -> list[Hypothesis]:
+                        rng: np.random.Generator, directions: int = 160, subsets: int = 40, keep: int = 6,
+                        whole: np.ndarray | None = None) -> list[Hypothesis]:
     """Axis lines from one window.
 
     Args:
         rays: (n, m, 3) rays (x, y, 1) of n tracks in m frames; frame 0 is the reference. NaN if not seen.
         frames: (m,) frame numbers.
-        profile: (m,) motion profile, 0 at the reference and 1 at the largest motion.
+        profile: (m,) or (n, m) motion profile, 0 at the reference; 1 is the angle that is searched.
         weight: (n,) weight of each track (its motion, its share of the picture).
         tol: truncation of the reprojection error, in ray units (px / focal).
         rng: for the subsets.
         directions, subsets, keep: size of the search and number of results.
+        whole: profile in `frames` that the hypotheses carry (default: `profile`).
     """
     n, m, _ = rays.shape
+    whole = profile if whole is None else whole
+    per_track = np.broadcast_to(profile, (n, m))
+    shared = profile.ndim == 1
     seen = np.isfinite(rays[..., 0])
     x = np.where(seen[..., None], rays, 0.0)
     dirs = hemisphere(directions)
@@ -85,13 +96,15 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
     motion2 = np.nanmax(np.sum((rays - rays[:, :1]) ** 2, axis=-1), axis=1)
     found: list[tuple[float, np.ndarray, np.ndarray, float]] = []
     for theta in angles:
-        q = theta * profile
-        R = Rotation.from_rotvec((dirs[:, None] * q[None, :, None]).reshape(-1, 3)).as_matrix().reshape(directions, m, 3, 3)
+        q = theta * (profile[None] if shared else per_track)[:, 1:]         # (1 or n, m-1)
         basis = perpendicular_basis(dirs)
-        y = np.einsum("dmij,nj->dnmi", R[:, 1:], x[:, 0])
-        A = np.cross(x[None, :, 1:], y)                                  # (d, n, m-1, 3)
-        C = basis[:, None] - np.einsum("dmij,djk->dmik", R[:, 1:], basis)  # (I - R) basis
-        B = np.cross(x[None, :, 1:, None, :], np.swapaxes(C, -1, -2)[:, None])  # (d, n, m-1, 2, 3)
+        y = _rotate(dirs[:, None, None], q[None], x[None, :, :1])           # (d, n, m-1, 3)
+        A = np.cross(x[None, :, 1:], y)
+        C = np.stack(                                                        # (I - R) basis, (d, 1 or n, m-1, 2, 3)
+            [basis[:, None, None, :, k] - _rotate(dirs[:, None, None], q[None], basis[:, None, None, :, k]) for k in range(2)],
+            axis=-2,
+        )
+        B = np.cross(x[None, :, 1:, None, :], C)
         AA = np.einsum("dnmi,dnmi->dn", A, A) + 1e-12
         AB = np.einsum("dnmi,dnmki->dnk", A, B)
         BB = np.einsum("dnmki,dnmli->dnkl", B, B)
@@ -112,26 +125,28 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
     found.sort(key=lambda f: -f[0])
     out: list[Hypothesis] = []
     for score, a, c, theta in found:
-        if any(abs(h.axis @ a) > 0.98 and abs(h.point @ c) > 0.97 and np.sign(h.q.sum()) == np.sign((theta * profile).sum()) for h in out):
+        if any(abs(h.axis @ a) > 0.98 and abs(h.point @ c) > 0.97 and np.sign(h.q.sum()) == np.sign((theta * whole).sum()) for h in out):
             continue
-        out.append(Hypothesis("revolute", a, c, frames, theta * profile, score))
+        out.append(Hypothesis("revolute", a, c, frames, theta * whole, score))
         if len(out) >= keep:
             break
     return out
 
 
 def prismatic_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarray, weight: np.ndarray, tol: float,
-                         rng: np.random.Generator, directions: int = 600, keep: int = 3) -> list[Hypothesis]:
+                         rng: np.random.Generator, directions: int = 600, keep: int = 3,
+                         whole: np.ndarray | None = None) -> list[Hypothesis]:
     """Slide directions from one window; arguments as for :func:`revolute_hypotheses`.
 
     With a common slide s_t d, |d| = 1, every track's depth follows linearly; depths are relative to the stroke.
     """
     n, m, _ = rays.shape
+    whole = profile if whole is None else whole
     seen = np.isfinite(rays[..., 0])
     x = np.where(seen[..., None], rays, 0.0)
     dirs = np.concatenate([hemisphere(directions // 2), -hemisphere(directions // 2)])
     A = np.cross(x[:, 1:], np.broadcast_to(x[:, :1], x[:, 1:].shape))
-    B = np.cross(x[None, :, 1:], dirs[:, None, None]) * profile[None, None, 1:, None]
+    B = np.cross(x[None, :, 1:], dirs[:, None, None]) * np.broadcast_to(profile, (n, m))[None, :, 1:, None]
     AA = np.einsum("nmi,nmi->n", A, A) + 1e-12
     lam = -np.einsum("nmi,dnmi->dn", A, B) / AA
     r = np.einsum("nmi,dn->dnmi", A, lam) + B
@@ -143,7 +158,7 @@ def prismatic_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarr
         if any(h.axis @ dirs[d] > 0.97 for h in out):
             continue
         depth = np.median(lam[d][lam[d] > 0]) if (lam[d] > 0).any() else 1.0
-        out.append(Hypothesis("prismatic", dirs[d], None, frames, profile / depth, float(score[d])))
+        out.append(Hypothesis("prismatic", dirs[d], None, frames, whole / depth, float(score[d])))
         if len(out) >= keep:
             break
     return out

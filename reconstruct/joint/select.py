@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ def key_frames(uv: np.ndarray, count: int = 28) -> np.ndarray:
     T = uv.shape[1]
     step = np.linalg.norm(np.diff(uv, axis=1), axis=-1)
     seen = np.isfinite(step)
-    speed = np.array([np.quantile(step[seen[:, t], t], 0.6) if seen[:, t].sum() > 3 else 0.0 for t in range(T - 1)])
+    speed = np.array([np.quantile(step[seen[:, t], t], 0.9) if seen[:, t].sum() > 3 else 0.0 for t in range(T - 1)])
     total = np.concatenate([[0], np.cumsum(speed + 0.03 * speed.max() + 1e-9)])
     return np.unique(np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, T - 1))
 
@@ -41,18 +42,30 @@ def observations(uv_work: np.ndarray, focal_work: float, centre: np.ndarray, fra
     near = (np.linalg.norm(place[:, None] - place[None], axis=-1) < 0.02 * diagonal) & (np.abs(middle[:, None] - middle[None]) <= 3)
     weight = 1.0 / np.sqrt(near.sum(1))
     motion = np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1)
-    weight *= np.clip(np.linalg.norm(motion, axis=1) / (0.06 * diagonal), 0.1, 1.0)
+    reach = np.linalg.norm(motion, axis=1)
+    weight *= np.clip(reach / (0.06 * diagonal), 0.05, 1.0) * coherence(uv_work[ids])
     if len(ids) > limit:
-        pick = np.sort(rng.choice(len(ids), limit, replace=False, p=weight / weight.sum()))
+        pick = np.sort(rng.choice(len(ids), limit, replace=False, p=weight**2 / np.sum(weight**2)))
         ids, uv, seen, middle, weight = ids[pick], uv[pick], seen[pick], middle[pick], weight[pick]
     xy = np.where(seen[..., None], (uv - centre) / focal_work, 0.0)
     return Observations(xy, seen, middle, weight, 1.0 / focal_work, frames), ids
 
 
+def coherence(uv: np.ndarray) -> np.ndarray:
+    """(N,) extent of each track's path over half its length, in [0, 1]: jitter and random walks score low.
+
+    A point that goes and comes back has 1, as has one that goes once.
+    """
+    step = np.diff(uv[:, ::3], axis=1)
+    path = np.nansum(np.linalg.norm(step, axis=-1), axis=1)
+    extent = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)
+    return np.clip(2 * extent / np.maximum(path, 1e-6), 0, 1) ** 2
+
+
 def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int = 10) -> list[Hypothesis]:
     """Hypotheses from windows around several reference key frames, both directions of time."""
     K = len(obs.frames)
-    found: list[Hypothesis] = []
+    found: list[Hypothesis] = _global_hypotheses(obs, rng)
     for ref in np.unique(np.linspace(0, K - 1, windows).round().astype(int)):
         for span in (np.arange(ref, K), np.arange(ref, -1, -1)):
             for length in {min(len(span), K // 3), len(span)}:
@@ -61,6 +74,56 @@ def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int 
                     continue
                 found += _one_window(obs, keys, rng)
     return found
+
+
+def global_profile(obs: Observations) -> np.ndarray:
+    """(K,) signed, accumulated image speed of the fastest tracks: a first guess of q up to scale.
+
+    A reversal shows as tracks that turn back between consecutive intervals.
+    """
+    xy = np.where(obs.seen[..., None], obs.xy, np.nan)
+    step = np.diff(xy, axis=1)
+    length = np.linalg.norm(step, axis=-1)
+    K = len(obs.frames)
+    speed = np.zeros(K - 1)
+    sign = np.ones(K - 1)
+    for k in range(K - 1):
+        ok = np.isfinite(length[:, k])
+        if ok.sum() < 4:
+            continue
+        order = np.argsort(length[ok, k])
+        share = np.cumsum(obs.weight[ok][order]) / obs.weight[ok].sum()
+        speed[k] = length[ok, k][order][np.searchsorted(share, 0.85).clip(0, ok.sum() - 1)]
+        if k:
+            both = ok & np.isfinite(length[:, k - 1])
+            dot = np.sum(step[both, k] * step[both, k - 1], axis=-1) * obs.weight[both]
+            sign[k] = sign[k - 1] * (-1 if dot.sum() < 0 else 1)
+    return np.concatenate([[0], np.cumsum(speed * sign)])
+
+
+def _global_hypotheses(obs: Observations, rng: np.random.Generator, rounds: int = 4) -> list[Hypothesis]:
+    """Hypotheses from tracks of all reference frames at once, each against its own reference."""
+    profile = global_profile(obs)
+    span = np.ptp(profile)
+    if span < 6 * obs.px:
+        return []
+    profile /= span
+    K, m = len(obs.frames), 7
+    out: list[Hypothesis] = []
+    for _ in range(rounds):
+        n = min(90, len(obs.ref))
+        ids = rng.choice(len(obs.ref), n, replace=False, p=obs.weight / obs.weight.sum())
+        rays = np.full((n, m, 3), np.nan)
+        local = np.zeros((n, m))
+        for row, i in enumerate(ids):
+            keys = np.flatnonzero(obs.seen[i])
+            keys = keys[np.unique(np.linspace(0, len(keys) - 1, m).round().astype(int))]
+            keys = np.roll(keys, -(len(keys) // 2))            # the middle one is the reference
+            rays[row, : len(keys)] = np.concatenate([obs.xy[i, keys], np.ones((len(keys), 1))], axis=1)
+            local[row, : len(keys)] = profile[keys] - profile[keys[0]]
+        args = (rays, np.arange(K), local, obs.weight[ids], 3.0 * obs.px, rng)
+        out += revolute_hypotheses(*args, whole=profile) + prismatic_hypotheses(*args, whole=profile)
+    return out
 
 
 def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator) -> list[Hypothesis]:
@@ -82,13 +145,16 @@ def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator) -
     rays[~obs.seen[ids][:, k]] = np.nan
     moved = np.linalg.norm(rays[..., :2] - rays[:, :1, :2], axis=-1)
     top = np.nanmax(moved, axis=1)
-    strong = top > np.median(top)
+    w = obs.weight[ids] * np.clip(top / (30 * obs.px), 0, 1)
+    # The profile is read off the tracks that move most: the others are the static link, or jitter.
+    strong = np.argsort(-w)[: max(4, len(ids) // 4)]
     profile = np.nan_to_num(np.nanmedian(moved[strong], axis=0))
     if profile.max() < 6 * obs.px:
         return []
     profile = profile / profile.max()
     tol = 3.0 * obs.px
-    w = obs.weight[ids]
+    if (w > 0).sum() < 8:
+        return []
     return revolute_hypotheses(rays, k, profile, w, tol, rng) + prismatic_hypotheses(rays, k, profile, w, tol, rng)
 
 
@@ -177,9 +243,11 @@ def explained(s: State, obs: Observations, scale: float = SCORE_PX) -> tuple[flo
     return float(np.sum(obs.weight * np.clip(per, 0, None) * np.sqrt(obs.seen.sum(1)))), per
 
 
-def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: int = 10) -> list[State]:
+def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: int = 10,
+           progress: Callable[[float], None] = lambda _: None) -> list[State]:
     """Best joints of both types, best first."""
     hyps = window_hypotheses(obs, rng)
+    progress(0.4)
     out: list[State] = []
     for kind in ("revolute", "prismatic"):
         pool = sorted((h for h in hyps if h.kind == kind), key=lambda h: -h.score)[:coarse]
@@ -188,6 +256,7 @@ def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: 
         fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in _distinct(states, fine)]
         fined.sort(key=lambda s: -explained(s, obs)[0])
         out += [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
+        progress(0.8 if kind == "revolute" else 1.0)
     return sorted(out, key=lambda s: -explained(s, obs)[0])
 
 

@@ -24,15 +24,20 @@ ANCHOR_PX = 2.0
 CHANGE_GREY = 18.0
 
 
-def reference_frames(video: Video, count: int = 16) -> np.ndarray:
-    """(R,) working frames, spread evenly over accumulated picture change (first and last included)."""
+def reference_frames(video: Video, hands: Hands | None = None, count: int = 18) -> np.ndarray:
+    """(R,) working frames, spread evenly over picture change outside hands (first and last included)."""
     import cv2
 
-    small = [cv2.resize(f, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.int16) for f in video.frames]
+    size = (video.frames.shape[2] // 4, video.frames.shape[1] // 4)
+    free = [np.ones(size[::-1], bool)] * len(video)
+    if hands is not None:
+        grow = np.ones((7, 7), np.uint8)
+        free = [cv2.dilate(cv2.resize(m.astype(np.uint8), size), grow) == 0 for m in hands.mask]
+    small = [cv2.resize(f, size, interpolation=cv2.INTER_AREA).astype(np.int16) for f in video.frames]
     change = np.zeros(len(video))
     for t in range(1, len(video)):
         d = np.abs(small[t] - small[t - 1]).max(axis=-1)
-        change[t] = np.mean(np.clip(d - 8, 0, 24))
+        change[t] = np.mean(np.clip(d - 8, 0, 24) * (free[t] & free[t - 1]))
     total = np.cumsum(change + 0.05 * change.mean() + 1e-6)
     wanted = np.linspace(total[0], total[-1], count)
     return np.unique(np.searchsorted(total, wanted).clip(0, len(video) - 1))
@@ -69,7 +74,7 @@ def track_points(video: Video, hands: Hands | None = None, references: np.ndarra
     """
     import cv2
 
-    references = reference_frames(video) if references is None else np.asarray(references)
+    references = reference_frames(video, hands) if references is None else np.asarray(references)
     region = change_region(video)
     covered = None
     if hands is not None and hands.mask is not None:

@@ -1,0 +1,187 @@
+"""One joint from point tracks of a static camera, without depth: the public entry of this room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruct.cues import Tracks
+from reconstruct.joint.bundle import Observations, State, refine, transport
+from reconstruct.joint.evidence import free_motion, held_out_costs, type_probability
+from reconstruct.joint.models import JointFit
+from reconstruct.joint.select import SCORE_PX, explained, key_frames, observations, search
+from reconstruct.joint.uncertainty import joint_std
+from reconstruct.joint.world import assumed_up, world_from_camera
+from reconstruct.video import Video
+
+DEFAULT_FOCAL = 0.8
+"""Focal length over the image's long side where nothing is known (phones: 0.7 to 0.85)."""
+FOCAL_STD = 0.12
+MOVING_SHARE = 0.012
+"""A track moves if its extent exceeds this share of the image diagonal."""
+MIN_INLIERS = 8
+
+
+def fit_joint(video: Video, tracks: Tracks, focal_px: float | None = None, seed: int = 0,
+              progress: Callable[[float], None] | None = None) -> JointFit:
+    """Joint type, axis, states and the moving link's points from tracks of one static camera.
+
+    Args:
+        video: stabilised video (sizes, times; no pixel is read).
+        tracks: point tracks of everything that moves, hands excluded as far as known.
+        focal_px: focal length in full px; the video's own or a typical one when None.
+        seed: of the random subsets.
+        progress: called with the done share.
+
+    Returns:
+        A JointFit up to scale (median depth of the link = 1), or one with verdict "refused".
+    """
+    rng = np.random.default_rng(seed)
+    tell = progress or (lambda _: None)
+    uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
+    h, w = video.frames.shape[1:3]
+    diagonal = float(np.hypot(h, w))
+    extent = np.zeros(len(uv))
+    some = tracks.visible.sum(1) > 1
+    extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
+    moving = np.flatnonzero(extent > MOVING_SHARE * diagonal)
+    if len(moving) < MIN_INLIERS:
+        return JointFit("refused", f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place", tracks=len(uv))
+    full = focal_px or video.focal_px or DEFAULT_FOCAL * max(video.size)
+    focal, centre = full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2])
+
+    keys = key_frames(uv[moving])
+    if len(keys) < 6:
+        return JointFit("refused", "the motion is too short: fewer than six distinct states", tracks=len(uv))
+    obs, _ = observations(uv[moving], focal, centre, keys, 260, rng, diagonal)
+    if len(obs.ref) < MIN_INLIERS:
+        return JointFit("refused", f"only {len(obs.ref)} moving tracks last long enough", tracks=len(uv))
+    candidates = search(obs, rng, progress=lambda x: tell(0.8 * x))
+    best = {}
+    for s in candidates:
+        best.setdefault(s.kind, s)
+    costs = {kind: held_out_costs(s, obs) for kind, s in best.items()}
+    probability = type_probability(costs, obs)
+    kind = max(probability, key=probability.get)
+    s = best[kind]
+    tell(0.85)
+
+    # All moving tracks, not just the sample of the search, for the consensus set.
+    every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
+    s = refine(_redepth(s, every), every, scales=(3.0, 2.0), iterations=8)
+    gain, per = explained(s, every)
+    link = per > 0.5
+    refusal = _why_refused(s, every, link, per)
+    if refusal:
+        return JointFit("refused", refusal, tracks=len(uv), inliers=int(link.sum()), type_probability=probability)
+    tell(0.9)
+
+    members = moving[ids[link]]
+    T = len(video)
+    dense = _all_frames(uv[members], focal, centre, every, link, T)
+    s = replace(s, q=np.interp(np.arange(T), keys, s.q), depth=s.depth[link])
+    s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
+    std = joint_std(s, dense, focal_std=FOCAL_STD if not (focal_px or video.focal_px) else 0.02)
+    tell(1.0)
+    return _result(video, s, dense, members, full, probability, std, len(uv))
+
+
+def _redepth(s: State, obs: Observations) -> State:
+    from reconstruct.joint.bundle import solve_depths
+
+    return solve_depths(replace(s, depth=np.ones(len(obs.ref))), obs)
+
+
+def _why_refused(s: State, obs: Observations, link: np.ndarray, per: np.ndarray) -> str | None:
+    """A sentence if the best joint is not believable."""
+    if link.sum() < MIN_INLIERS:
+        return f"no joint: only {int(link.sum())} tracks agree with the best one ({s.kind})"
+    free = free_motion(s, obs, link)
+    if free is not None and free.joint_px > 1.5 * free.free_px and free.joint_px - free.free_px > 0.5 and free.joint_px > 1.3:
+        return (
+            f"the part moves as a free body, not about one joint: a {s.kind} joint leaves {free.joint_px:.1f} px, "
+            f"a free rigid motion {free.free_px:.1f} px (working pixels)"
+        )
+    return None
+
+
+def _all_frames(uv: np.ndarray, focal: float, centre: np.ndarray, keyed: Observations, link: np.ndarray, T: int) -> Observations:
+    seen = np.isfinite(uv[..., 0])
+    xy = np.where(seen[..., None], (uv - centre) / focal, 0.0)
+    ref = keyed.frames[keyed.ref[link]]
+    return Observations(xy, seen, ref, keyed.weight[link], 1.0 / focal, np.arange(T))
+
+
+def _result(video: Video, s: State, obs: Observations, members: np.ndarray, full_focal: float,
+            probability: dict[str, float], std: dict, tracks: int) -> JointFit:
+    """World frame, signs, units and the contract's fields."""
+    X, _ = transport(s, obs)
+    r = np.linalg.norm(np.where(obs.seen[..., None], _residual(X, obs), np.nan), axis=-1)
+    rays = obs.ref_rays
+    # Points at q = 0: pull every track's own reference back.
+    zero = replace(s, q=np.concatenate([s.q, [0.0]]))
+    extra = replace(obs, xy=np.concatenate([obs.xy, np.zeros((len(rays), 1, 2))], axis=1),
+                    seen=np.concatenate([obs.seen, np.zeros((len(rays), 1), bool)], axis=1), frames=np.arange(len(s.q) + 1))
+    points = transport(zero, extra)[0][:, -1]
+    unit = float(np.median(X[..., 2][obs.seen]))
+    q, axis = s.q.copy(), s.axis.copy()
+    far = int(np.argmax(np.abs(q)))
+    if q[far] < 0:
+        q, axis = -q, -axis
+    points = points / unit
+    pivot = None
+    if s.kind == "prismatic":
+        q = q / unit
+        origin = np.median(points, axis=0)
+    else:
+        c = s.point / unit
+        pivot = c + axis * float(np.median((points - c) @ axis))
+        origin = pivot
+    moved = X[:, far] / unit
+    up, how = assumed_up(s.kind, axis, points, moved)
+    T_world_camera = world_from_camera(up, axis, origin)
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    K = np.array([[full_focal, 0, (video.size[0] - 1) / 2], [0, full_focal, (video.size[1] - 1) / 2], [0, 0, 1.0]])
+    p = max(probability.values())
+    verdict, reason = "ok", f"{len(members)} tracks agree; {how}"
+    if p < 0.9:
+        verdict = "ambiguous"
+        names = " and ".join(sorted(probability, key=probability.get, reverse=True))
+        reason = f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}"
+    std = dict(std, point_m=std["point"] / unit, q=std["q"] / (unit if s.kind == "prismatic" else 1.0))
+    std.pop("point")
+    fit = JointFit(
+        verdict, reason, s.kind, probability, R @ axis, None if pivot is None else R @ pivot + t, None, q,
+        video.index, K, np.linalg.inv(T_world_camera), points @ R.T + t, members, False, "none", std,
+        residual_px=float(np.nanmedian(r)) / video.scale, inliers=len(members), tracks=tracks,
+        moving_frames=_moving_frames(q, video.time),
+    )
+    return replace(fit, image_line=image_line(fit))
+
+
+def _residual(X: np.ndarray, obs: Observations) -> np.ndarray:
+    from reconstruct.joint.bundle import reprojection
+
+    return reprojection(X, obs)
+
+
+def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """(T,) frames in which |dq/dt| exceeds 4 % of the range a second, and 10 % of its upper quartile."""
+    rate = np.abs(np.gradient(q, time))
+    return rate > max(0.04 * np.ptp(q), 0.1 * np.quantile(rate, 0.95))
+
+
+def image_line(fit: JointFit) -> np.ndarray:
+    """(2, 2) full px: the axis along the link's extent, or the slide from its start to its far end."""
+    if fit.type == "prismatic":
+        start = np.median(fit.points, axis=0)
+        ends = np.stack([start, start + fit.axis * fit.q[int(np.argmax(np.abs(fit.q)))]])
+    else:
+        along = (fit.points - fit.point) @ fit.axis
+        lo, hi = np.quantile(along, [0.05, 0.95])
+        if hi - lo < 1e-6:
+            lo, hi = lo - 0.02, hi + 0.02
+        ends = fit.point + np.outer([lo, hi], fit.axis)
+    return fit.project(ends)
