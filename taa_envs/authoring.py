@@ -7,9 +7,9 @@ import json
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from taa_envs.asset import (
     demonstration,
     load_asset,
 )
+from taa_envs.files import folder_written_whole
 from taa_envs.surface import link_inertia, write_convex_part, write_textured_obj
 
 # A video carries no forces: these are assumptions, and asset.json says so.
@@ -34,7 +35,7 @@ HAND_FORCE = (0.5, 8.0)  # N at the link's far end: least and most that friction
 ARMATURE_SHARE = 0.01  # of the link's inertia, for the solver's conditioning
 
 
-def _plain(value: object) -> object:
+def _plain(value: object) -> Any:
     """JSON-ready copy: arrays to lists, numbers that are not finite to None."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
@@ -121,7 +122,9 @@ def _write_model(folder: Path, asset_id: str, links: Mapping[str, object], kind:
             body.add_joint(name="joint", type=mujoco.mjtJoint.mjJNT_HINGE if hinge else mujoco.mjtJoint.mjJNT_SLIDE,
                            axis=axis, pos=point if hinge else np.zeros(3), range=joint_range, limited=1,
                            damping=[numbers["damping"], 0, 0], frictionloss=numbers["frictionloss"],
-                           armature=numbers["armature"])
+                           armature=numbers["armature"],
+                           # A hard stop: MuJoCo's default yields to a hand in proportion to the link's lightness.
+                           solref_limit=[0.005, 1.0], solimp_limit=[0.99, 0.9999, 0.001, 0.5, 2.0])
         write_textured_obj(folder / "meshes", name, link)
         spec.add_mesh(name=name, file=f"{name}.obj", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
@@ -257,53 +260,34 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
         **(provenance or {}),
     }
 
-    root.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{asset_id}.", dir=root))
     try:
-        folder = work / asset_id
-        folder.mkdir()
-        model_notes = _write_model(folder, asset_id, {"static": static, "moving": moving}, kind, axis, point, limits,
-                                   numbers, (body_mass, centre, tensor))
-        np.savez_compressed(folder / "reference.npz", time=ref.time, q=ref.q, hand_joints=ref.hand_joints,
-                            hand_valid=ref.hand_valid, contact=ref.contact)
-        document = {
-            "schema": SCHEMA, "id": asset_id,
-            "joint": {**joint, "type": kind, "axis": axis, "point": point if kind == "revolute" else None},
-            "demo": demo, "camera": camera, "provenance": made,
-            "collision": {"excluded_pairs": [["static", "moving"]],
-                          "reason": "the joint's range is its stop; the links are made not to meet within it"},
-            "source": source, "providers": list(providers), "mujoco_version": mujoco.__version__,
-            "taa_envs_version": _own_version(), "notes": [*notes, *model_notes],
-        }
-        (folder / "asset.json").write_text(json.dumps(_plain(document), indent=1, allow_nan=False), encoding="utf-8")
-        for name, content in (files or {}).items():
-            if Path(name).name != name or name in ("asset.json", "model.xml", "reference.npz", "meshes"):
-                raise AssetError(f"cannot put a further file under the name {name!r}")
-            if isinstance(content, bytes):
-                (folder / name).write_bytes(content)
-            else:
-                shutil.copyfile(content, folder / name)
-        load_asset(folder)
-        _publish(folder, final, work, overwrite)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        with folder_written_whole(final, overwrite) as folder:
+            model_notes = _write_model(folder, asset_id, {"static": static, "moving": moving}, kind, axis, point, limits,
+                                       numbers, (body_mass, centre, tensor))
+            np.savez_compressed(folder / "reference.npz", time=ref.time, q=ref.q, hand_joints=ref.hand_joints,
+                                hand_valid=ref.hand_valid, contact=ref.contact)
+            document = {
+                "schema": SCHEMA, "id": asset_id,
+                "joint": {**joint, "type": kind, "axis": axis, "point": point if kind == "revolute" else None},
+                "demo": demo, "camera": camera, "provenance": made,
+                "collision": {"excluded_pairs": [["static", "moving"]],
+                              "reason": "the joint's range is its stop; the links are made not to meet within it"},
+                "source": source, "providers": list(providers), "mujoco_version": mujoco.__version__,
+                "taa_envs_version": _own_version(), "notes": [*notes, *model_notes],
+            }
+            text = json.dumps(_plain(document), indent=1, allow_nan=False)
+            (folder / "asset.json").write_text(text, encoding="utf-8")
+            for name, content in (files or {}).items():
+                if Path(name).name != name or name in ("asset.json", "model.xml", "reference.npz", "meshes"):
+                    raise AssetError(f"cannot put a further file under the name {name!r}")
+                if isinstance(content, bytes):
+                    (folder / name).write_bytes(content)
+                else:
+                    shutil.copyfile(content, folder / name)
+            load_asset(folder)
+    except FileExistsError:  # made by somebody else while we worked
+        raise AssetExists(f"{final} exists; choose another id or overwrite it") from None
     return load_asset(final, check_model=False)
-
-
-def _publish(folder: Path, final: Path, work: Path, overwrite: bool) -> None:
-    """Rename into place; the one replaced is moved aside first and comes back if the rename fails."""
-    if not (final.exists() or final.is_symlink()):
-        folder.rename(final)
-        return
-    if not overwrite:  # made by somebody else while we worked
-        raise AssetExists(f"{final} exists; choose another id or overwrite it")
-    aside = work / "replaced"
-    final.rename(aside)
-    try:
-        folder.rename(final)
-    except OSError:
-        aside.rename(final)
-        raise
 
 
 def _own_version() -> str:

@@ -18,9 +18,10 @@ contract, at the end of the replay:
   that lies on the axis), or square to the axis through the centre of mass (prismatic). Reflection turns the
   demonstrated motion about: the hand is as near to the link, on its other side, and moves the wrong way. Finds joints
   that answer to a hand's presence rather than to its push.
-- *late_hand*: the whole hand motion delayed by the time from the demonstrated onset (the first ``contact`` frame or 1 %
-  progress, whichever is first) to the replay's end, so that the hand is about to begin when time is up. Finds joints
-  that move by the clock, and starts whose overlap of hand and link alone pushes.
+- *late_hand*: the hand motion delayed by the replay's own length, so that the hand waits where the video began while
+  the demonstrated motion would take place. Finds joints that move by the clock, and first poses whose overlap of hand
+  and link alone pushes. (A delay that ended with the hand at the link would measure how hard a waiting hand leans on
+  it, which on a stroke of millimetres is no small part.)
 """
 
 from __future__ import annotations
@@ -36,7 +37,6 @@ from taa_envs.simulation import Diverged, HandPath, Simulation, Step
 
 CONTROLS = ("no_hand", "mirrored_hand", "late_hand")
 HOLD = 0.2  # s for which the hand stays at its last pose: time for what it pushes to catch up
-ONSET = 0.01  # progress at which the demonstrated stroke has begun
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,7 @@ def control_path(scene: Scene, name: str) -> HandPath | None:
         away = (reference.hand_joints - point) @ normal
         return HandPath(reference.time, reference.hand_joints - 2 * away[..., None] * normal)
     if name == "late_hand":
-        onset = int(np.argmax((asset.stroke_fraction(reference.q) >= ONSET) | reference.contact))
-        delay = asset.end_time + HOLD - reference.time[max(onset - 1, 0)]
-        return HandPath(reference.time + delay, reference.hand_joints)
+        return HandPath(reference.time + asset.end_time + HOLD - reference.time[0], reference.hand_joints)
     raise ValueError(f"no control is named {name!r}; known: {', '.join(CONTROLS)}")
 
 

@@ -151,15 +151,17 @@ def build_spec(asset: Asset, hand: object | None, *, touch_static: bool = False)
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, size],
                             pos=[centre[0], centre[1], lowest - FLOOR_GAP], material="floor", contype=0, conaffinity=0)
     spec.worldbody.add_light(name="key", pos=centre + size * np.array([1.5, -2.0, 3.0]), dir=[-0.4, 0.55, -0.8],
-                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=True, diffuse=[0.55] * 3)
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=True, diffuse=[0.35] * 3)
     spec.worldbody.add_light(name="fill", pos=centre + size * np.array([-2.0, 1.0, 2.0]), dir=[0.7, -0.4, -0.6],
-                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False, diffuse=[0.25] * 3)
-    spec.visual.headlight.ambient = [0.35] * 3
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False, diffuse=[0.15] * 3)
+    # Mostly ambient: the colours come from a video and hold its light already.
+    spec.visual.headlight.ambient = [0.6] * 3
     spec.visual.headlight.diffuse = [0.25] * 3
     spec.visual.headlight.specular = [0.0] * 3
     spec.visual.global_.offwidth = spec.visual.global_.offheight = 2560
     spec.visual.quality.shadowsize = 4096
     spec.visual.map.znear = 0.005
+    spec.visual.map.shadowclip = 10.0  # wide enough that the shadow map's rim, which flickers, is out of sight
     spec.stat.center, spec.stat.extent = centre, size
     _add_cameras(spec, asset, centre, size)
     if hand is not None:
