@@ -126,7 +126,8 @@ def _carried(drive: Drive, valid: np.ndarray, moving: np.ndarray, rate: float) -
     out = np.zeros(len(valid), bool)
     reach = max(1, round(CARRY_SECONDS * rate))
     for a, b in runs(~valid):
-        before = a > 0 and drive.attached[max(0, a - reach) : a].any() and drive.near[max(0, a - 3) : a].any()
+        # Lost at the part is holding it; found at the part was holding it only if it goes on to move it.
+        before = a > 0 and drive.attached[:a].any() and drive.near[max(0, a - 3) : a].any()
         after = b < len(valid) and drive.attached[b : b + reach].any() and drive.near[b : b + 3].any()
         if before and moving[a:b].any():
             out[a : a + int(np.flatnonzero(moving[a:b])[-1]) + 1] = True
@@ -157,9 +158,8 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
     shape = LinkShape(geometry.moving)
     moving = moving_frames(fit, time)
-    drive = find_drive(hands, fit, time, np.asarray(geometry.moving.vertices))
-    if drive.index is None:
-        drive = find_drive(hands, fit, time)
+    surface = np.asarray(geometry.moving.vertices, float)
+    drive = find_drive(hands, fit, time, surface if fit.points is None else np.concatenate([surface, fit.points]))
     if drive.index is None:
         why = "no hand was seen" if not hands.tracks else "no hand moves with the part while it moves"
         return _absent(video, fit, shape, f"{why}: the demonstration holds no hand that drives the part")

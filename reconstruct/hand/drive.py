@@ -15,7 +15,7 @@ from reconstruct.cues import Hands, HandTrack
 from reconstruct.hand.skeleton import CONTACT, palm_pixels
 from reconstruct.joint.models import JointFit
 
-NEAR = 0.6  # palm sizes between the nearest finger joint and the part's outline
+NEAR, BESIDE = 0.6, 1.5  # palm sizes between the nearest finger joint and the part's outline: at it, and beside it
 AGREE = 0.5  # difference of the motions, relative to the part's own
 WINDOWS = (0.2, 0.4, 0.7, 1.0)  # s over which motion is compared, the shortest that shows enough of it
 
@@ -72,18 +72,20 @@ def _outside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 
 def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndarray, moving: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray]:
-    """near (T,), drives (T,) of one hand; surface (M, 3): points of the link at q = 0, world."""
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of one hand: apart (T,) from the part in palm sizes (NaN unseen); moves with it (T,) and otherwise (T,).
+
+    Neither of the last two holds where the part moves too little to tell. surface (M, 3): points of the link at q = 0.
+    """
     n = len(time)
-    near, agree = np.zeros(n, bool), np.zeros(n, bool)
+    away, agree, differ = np.full(n, np.nan), np.zeros(n, bool), np.zeros(n, bool)
     pose = fit.link_pose(fit.q)
     picture = [fit.project(surface @ pose[t, :3, :3].T + pose[t, :3, 3]) for t in range(n)]
     for t in np.flatnonzero(hand.valid):
-        apart = _outside(hand.uv[t, CONTACT], picture[t])
-        near[t] = apart.min() < NEAR * palm_pixels(hand.uv[t])
+        away[t] = _outside(hand.uv[t, CONTACT], picture[t]).min() / max(float(palm_pixels(hand.uv[t])), 1.0)
     rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
     spans = np.unique(np.round(0.5 * np.array(WINDOWS) * rate).astype(int).clip(1))
-    for t in np.flatnonzero(near & moving):
+    for t in np.flatnonzero((away < BESIDE) & moving):
         size = float(palm_pixels(hand.uv[t]))
         gap = np.linalg.norm(hand.uv[t, CONTACT][:, None] - picture[t][None], axis=-1)
         # The part's motion at its surface points nearest to the hand.
@@ -96,8 +98,21 @@ def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndar
                 continue
             own = np.median(hand.uv[b, CONTACT] - hand.uv[a, CONTACT], axis=0)
             agree[t] = np.linalg.norm(own - part) < AGREE * np.linalg.norm(part)
+            differ[t] = not agree[t]
             break
-    return near, near & moving & agree
+    return away, agree, differ
+
+
+def _extend(attached: np.ndarray, moving: np.ndarray, beside: np.ndarray, differ: np.ndarray) -> np.ndarray:
+    """Over the neighbouring frames of one movement: a part that a hand moves was moved by it from the beginning."""
+    out = attached.copy()
+    for a, b in runs(attached):
+        while a > 0 and moving[a - 1] and beside[a - 1] and not differ[a - 1]:
+            a -= 1
+        while b < len(out) and moving[b] and beside[b] and not differ[b]:
+            b += 1
+        out[a:b] = True
+    return out
 
 
 def _majority(flags: np.ndarray, among: np.ndarray, half: int) -> np.ndarray:
@@ -127,16 +142,19 @@ def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarra
     motion = np.abs(np.gradient(fit.q))
     best, best_motion = None, 0.0
     for i, hand in enumerate(hands.tracks):
-        near, drives = _evidence(hand, fit, time, surface, moving)
-        drives = _majority(drives, near & moving, max(2, round(0.15 * rate)))
+        away, agree, differ = _evidence(hand, fit, time, surface, moving)
+        near = away < NEAR
+        half = max(2, round(0.15 * rate))
+        drives = _majority(agree, near & moving, half)
+        differ = _majority(differ, (away < BESIDE) & moving, half)
         driven = float(motion[drives].sum())
         if driven > best_motion:
-            best, best_motion = (i, near, drives), driven
+            best, best_motion = (i, near, drives, away < BESIDE, differ), driven
     if best is None or best_motion < 0.05 * float(motion.sum()) or best[2].sum() < 3:
         return Drive(None, nobody, nobody, nobody)
-    index, near, drives = best
+    index, near, drives, beside, differ = best
     valid = hands.tracks[index].valid
-    attached = close_gaps(drives, 4)
+    attached = _extend(close_gaps(drives, 4), moving, beside, differ)
     # Between two driven stretches a hand that never leaves the part rests on it.
     stretches = runs(attached)
     for (_, a), (b, _) in zip(stretches, stretches[1:], strict=False):

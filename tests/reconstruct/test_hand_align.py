@@ -43,7 +43,7 @@ def test_a_monocular_hand_becomes_one_that_drives_the_part(name: str, seed: int,
     assert result["contact_fraction"] > 0.8
     # Contact is claimed only while the true hand holds on, and in most of the frames in which it moves the part.
     moves = np.abs(np.gradient(scene.fit.q)) > 0.1 * np.abs(np.gradient(scene.fit.q)).max()
-    assert not reference.contact[~scene.motion.contact].any()
+    assert not reference.contact[~scene.contact].any()
     assert reference.contact[moves].mean() > 0.8
     assert not reference.hand_valid[40:48].any()
     assert any("not seen" in note for note in reference.notes)
