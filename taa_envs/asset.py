@@ -14,6 +14,7 @@ import stat
 import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path, PurePosixPath
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -389,7 +390,7 @@ def load_asset(path: str | os.PathLike, *, check_model: bool = True) -> Asset:
                  metadata=data)
 
 
-def save_asset(root: str | os.PathLike, asset_id: str, **kwargs: object) -> Asset:
+def save_asset(root: str | os.PathLike, asset_id: str, **kwargs: Any) -> Asset:
     """Write ``root/<asset_id>/`` atomically; see :func:`taa_envs.authoring.save_asset` for the arguments."""
     from taa_envs.authoring import save_asset as write
 

@@ -25,7 +25,7 @@ from taa_envs.asset import (
     load_asset,
 )
 from taa_envs.files import folder_written_whole
-from taa_envs.surface import link_inertia, write_convex_part, write_textured_obj
+from taa_envs.surface import Link, link_inertia, write_convex_part, write_textured_obj
 
 # A video carries no forces: these are assumptions, and asset.json says so.
 DENSITY = 300.0  # kg/m3 of the closed surface: sheet and foam, not solid steel
@@ -94,7 +94,7 @@ def _joint_numbers(joint: Mapping) -> tuple[str, np.ndarray, np.ndarray]:
     return kind, axis / norm, point
 
 
-def _write_model(folder: Path, asset_id: str, links: Mapping[str, object], kind: str, axis: np.ndarray,
+def _write_model(folder: Path, asset_id: str, links: Mapping[str, Link], kind: str, axis: np.ndarray,
                  point: np.ndarray, joint_range: tuple[float, float], numbers: Mapping[str, float],
                  inertial: tuple[float, np.ndarray, np.ndarray]) -> list[str]:
     """``model.xml`` and ``meshes/``; returns notes."""
@@ -182,7 +182,7 @@ def _joint_provenance(joint: Mapping, joint_range: tuple[float, float], unit: st
     return out
 
 
-def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static: object, moving: object,
+def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static: Link, moving: Link,
                reference: object, joint_range: tuple[float, float] | None = None, joint_origin: str = "fitted",
                mass: float | None = None, density: float = DENSITY, damping: float | None = None,
                frictionloss: float | None = None, camera: Mapping | None = None, provenance: Mapping | None = None,
@@ -262,8 +262,8 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
 
     try:
         with folder_written_whole(final, overwrite) as folder:
-            model_notes = _write_model(folder, asset_id, {"static": static, "moving": moving}, kind, axis, point, limits,
-                                       numbers, (body_mass, centre, tensor))
+            model_notes = _write_model(folder, asset_id, {"static": static, "moving": moving}, kind, axis, point,
+                                       limits, numbers, (body_mass, centre, tensor))
             np.savez_compressed(folder / "reference.npz", time=ref.time, q=ref.q, hand_joints=ref.hand_joints,
                                 hand_valid=ref.hand_valid, contact=ref.contact)
             document = {

@@ -20,6 +20,7 @@ from taa_envs.simulation import Diverged, HandPath, Simulation, Step
 SUCCESS_PROGRESS = 0.95
 DRIVEN_SHARE = 0.8  # of the progress made, what contact must have driven for a success
 TRANSLATION, ROTATION, CLOSURE = 0.03, 0.3, 0.5  # m, rad, share of the way: residuals of an action of 1
+ACTIONS = 7
 PALM = (0, 5, 9, 13, 17)
 TIPS = (4, 8, 12, 16, 20)
 # How far along its finger each landmark is: closing moves tips all the way, knuckles not at all.
@@ -116,9 +117,13 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
                              + (", video" if self.asset.camera is not None else ""))
         self.scales = reward_scales(reward)
         self.render_mode, self._camera = render_mode, camera
-        aspect = self.asset.camera["width"] / self.asset.camera["height"] if camera == "video" else 4 / 3
+        picture = self.asset.camera if camera == "video" else None
+        aspect = picture["width"] / picture["height"] if picture is not None else 4 / 3
         self._size = (round(height * aspect) if width is None else width, height)
         self._scene = build_scene(self.asset, hand, touch_static=touch_static)
+        if self._scene.hand is None:
+            raise ValueError("the environment needs a hand; name one")
+        self._hand = self._scene.hand
         self.simulation = Simulation(self._scene)
         self.frame_skip = round(CONTROL_PERIOD / TIMESTEP)
         self._path = HandPath(self.asset.reference.time, self.asset.reference.hand_joints)
@@ -126,7 +131,7 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         self._nominal = (model.dof_damping.copy(), model.dof_frictionloss.copy(), model.geom_friction.copy())
         self._stroke = self.asset.demo["q_demo_end"] - self.asset.demo["q_start"]
         self._renderer: Any = None
-        self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
         self.observation_space = spaces.Box(-10.0, 10.0, (5 + 63 + 63 + 7,), np.float32)
         self._begin(0.0, self.asset.demo["q_start"], np.zeros(3))
 
@@ -202,7 +207,7 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         before = float(self.asset.stroke_fraction(self.simulation.q))
         for _ in range(self.frame_skip):
             t = self._time
-            joints = apply_residual(self._path.at(t + self._scene.hand.lead), action) + self._offset
+            joints = apply_residual(self._path.at(t + self._hand.lead), action) + self._offset
             try:
                 made = self.simulation.step(joints)
             except Diverged:
@@ -217,7 +222,7 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         self._driven += driven
         self._last = total
         success = not diverged and self._success()
-        contact_tips = self._scene.hand.landmarks(self.simulation.data)[list(TIPS)]
+        contact_tips = self._hand.landmarks(self.simulation.data)[list(TIPS)]
         terms = reward_terms(RewardInputs(
             driven=driven, moved=float(self.asset.stroke_fraction(self.simulation.q)) - before, contact=total.contact,
             distance=0.0 if total.contact else self.simulation.surface_distance(contact_tips),
@@ -244,7 +249,7 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     def _observation(self) -> np.ndarray:
         asset, sim, duration = self.asset, self.simulation, self.asset.demo["duration"]
         t = self._time
-        here = self._scene.hand.landmarks(sim.data)
+        here = self._hand.landmarks(sim.data)
         demo_q = np.interp(t, asset.reference.time, asset.reference.q)
         parts = [
             [float(asset.stroke_fraction(sim.q)), sim.qvel * duration / self._stroke,

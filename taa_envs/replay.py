@@ -32,6 +32,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taa_envs.asset import Asset
+from taa_envs.hands import Hand
 from taa_envs.scene import Scene, build_scene
 from taa_envs.simulation import Diverged, HandPath, Simulation, Step
 
@@ -172,7 +173,7 @@ def simulate(scene: Scene, path: HandPath | None) -> Trajectory:
                       contact=columns[5], penetration=columns[6], driven=driven, q_extremes=(least, most))
 
 
-def replay(asset: Asset, hand: str | object = "points", *, controls: bool = True, touch_static: bool = False
+def replay(asset: Asset, hand: str | Hand = "points", *, controls: bool = True, touch_static: bool = False
            ) -> ReplayResult:
     """Replay the demonstration and its controls through contact.
 
@@ -209,7 +210,7 @@ def replay(asset: Asset, hand: str | object = "points", *, controls: bool = True
         controls=progress, trajectory=run, notes=tuple(notes))
 
 
-def render_frames(asset: Asset, trajectory: Trajectory, *, hand: str | object | None = "points",
+def render_frames(asset: Asset, trajectory: Trajectory, *, hand: str | Hand | None = "points",
                   camera: str | None = None, width: int | None = None, height: int = 480) -> Iterator[np.ndarray]:
     """Pictures of a replay, one a sample of its trajectory, so that frame i goes beside the video's frame i.
 

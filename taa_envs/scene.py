@@ -9,12 +9,16 @@ video. ``touch_static=True`` lets it touch. The links do not touch each other: t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taa_envs.asset import Asset
 from taa_envs.errors import AssetError
-from taa_envs.hands import make_hand
+from taa_envs.hands import Controller, Hand, make_hand
+
+if TYPE_CHECKING:
+    import mujoco
 
 TIMESTEP = 0.002  # s
 MOVING_BIT, STATIC_BIT = 1 << 1, 1 << 2
@@ -35,8 +39,8 @@ class Scene:
     """
 
     asset: Asset
-    model: object
-    hand: object | None
+    model: mujoco.MjModel
+    hand: Controller | None
     qpos: int
     dof: int
     hand_geoms: np.ndarray
@@ -46,20 +50,20 @@ class Scene:
     size: float
 
 
-def _mesh_points(model: object, data: object, geom: int) -> np.ndarray:
+def _mesh_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int | np.integer) -> np.ndarray:
     mesh = int(model.geom_dataid[geom])
     start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = model.mesh_vert[start:start + count].astype(float)
     return points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
 
 
-def _bounds(model: object) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """(2, 3) box at q = 0, and (2, 3) box over the joint's range, of all mesh geoms."""
     import mujoco
 
     data = mujoco.MjData(model)
     boxes = []
-    for q in (0.0, *np.linspace(*model.jnt_range[0], 7)):
+    for q in (0.0, *np.linspace(model.jnt_range[0, 0], model.jnt_range[0, 1], 7)):
         data.qpos[0] = q
         mujoco.mj_kinematics(model, data)
         points = np.concatenate([_mesh_points(model, data, g) for g in range(model.ngeom) if model.geom_dataid[g] >= 0])
@@ -88,7 +92,7 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
     return quat
 
 
-def _add_cameras(spec: object, asset: Asset, centre: np.ndarray, size: float) -> None:
+def _add_cameras(spec: mujoco.MjSpec, asset: Asset, centre: np.ndarray, size: float) -> None:
     import mujoco
 
     view = np.array([1.0, -1.0, 0.7])
@@ -110,7 +114,7 @@ def _add_cameras(spec: object, asset: Asset, centre: np.ndarray, size: float) ->
                               proj=mujoco.mjtProjection.mjPROJ_PERSPECTIVE)
 
 
-def build_spec(asset: Asset, hand: object | None, *, touch_static: bool = False) -> object:
+def build_spec(asset: Asset, hand: Hand | None, *, touch_static: bool = False) -> mujoco.MjSpec:
     """The scene as an uncompiled ``mujoco.MjSpec``; hand as from :func:`taa_envs.hands.make_hand`, None for none.
 
     Raises:
@@ -172,7 +176,7 @@ def build_spec(asset: Asset, hand: object | None, *, touch_static: bool = False)
     return spec
 
 
-def build_scene(asset: Asset, hand: str | object | None = "points", *, touch_static: bool = False) -> Scene:
+def build_scene(asset: Asset, hand: str | Hand | None = "points", *, touch_static: bool = False) -> Scene:
     """Compile asset, hand, floor, lights and the cameras ``overview`` and (where it is known) ``video``.
 
     Args:

@@ -46,12 +46,12 @@ def score_actions(asset: Asset, actions: np.ndarray, hand: str = "points") -> di
     Raises:
         ValueError: actions are not (N, 7) finite numbers.
     """
-    from taa_envs.env import ArticulationEnv
+    from taa_envs.env import ACTIONS, ArticulationEnv
 
     env = ArticulationEnv(asset, hand=hand)
     actions = np.asarray(actions, np.float32)
-    if actions.ndim != 2 or actions.shape[1:] != env.action_space.shape or not np.isfinite(actions).all():
-        raise ValueError(f"actions must be (N, {env.action_space.shape[0]}) finite numbers, have shape {actions.shape}")
+    if actions.ndim != 2 or actions.shape[1] != ACTIONS or not np.isfinite(actions).all():
+        raise ValueError(f"actions must be (N, {ACTIONS}) finite numbers, have shape {actions.shape}")
     _, info = env.reset(seed=0)
     q = [env.simulation.q]
     for action in np.clip(actions, -1, 1):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +16,23 @@ MIN_EDGE_SHARE = 1 / 150  # of the mesh's size: smaller faces are never split
 SOLID_THICKNESS = 1e-5  # m; a collision part thinner than this is not a solid
 
 
-def _arrays(link: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class Link(Protocol):
+    """A link's surface and collision parts; :class:`reconstruct.geometry.LinkMesh` is one.
+
+    vertices: (V, 3) m.  faces: (F, 3).  colors: (V, 3) or (V, 4) uint8.  parts: convex (vertices (v, 3), faces (f, 3)).
+    """
+
+    @property
+    def vertices(self) -> np.ndarray: ...
+    @property
+    def faces(self) -> np.ndarray: ...
+    @property
+    def colors(self) -> np.ndarray: ...
+    @property
+    def parts(self) -> Sequence[tuple[np.ndarray, np.ndarray]]: ...
+
+
+def _arrays(link: Link) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     vertices, faces = np.asarray(link.vertices, float), np.asarray(link.faces)
     colours = np.asarray(link.colors)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 3 or not np.isfinite(vertices).all():
@@ -43,7 +61,7 @@ def _refine(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> tup
     return vertices, faces, colours
 
 
-def write_textured_obj(folder: Path, name: str, link: object) -> None:
+def write_textured_obj(folder: Path, name: str, link: Link) -> None:
     """``name.obj`` and ``name.png``: MuJoCo has no vertex colours, so each face gets a texel of its own.
 
     All three corners of a face name the centre of its texel: no seam, filter or mip level can mix faces.
@@ -96,7 +114,7 @@ def write_convex_part(path: Path, part: tuple[np.ndarray, np.ndarray]) -> bool:
     return True
 
 
-def link_inertia(link: object, density: float, mass: float | None = None
+def link_inertia(link: Link, density: float, mass: float | None = None
                  ) -> tuple[float, np.ndarray, np.ndarray, float, str]:
     """Mass (kg), centre (3,) m, inertia about it (3, 3) kg m2, volume (m3), and a sentence on how.
 
@@ -108,7 +126,7 @@ def link_inertia(link: object, density: float, mass: float | None = None
     import trimesh
 
     vertices, faces, _ = _arrays(link)
-    surface = trimesh.Trimesh(vertices, faces, process=True)
+    surface: Any = trimesh.Trimesh(vertices, faces, process=True)
     how = "volume of the closed surface times density"
     if not (surface.is_watertight and surface.volume > 0):
         hulls = [trimesh.PointCloud(np.asarray(p[0], float)).convex_hull for p in link.parts if len(p[0]) >= 4]
@@ -118,7 +136,7 @@ def link_inertia(link: object, density: float, mass: float | None = None
         how = "volume of the convex parts times density (the surface is not closed)"
     volume = float(surface.volume)
     scale = (mass / volume) if mass is not None else density
-    tensor = np.asarray(surface.moment_inertia, float) * scale
+    tensor = scale * np.asarray(surface.moment_inertia)
     # MuJoCo wants moments that obey the triangle inequality with room to spare; a flat sheet sits on its edge.
     tensor = (tensor + tensor.T) / 2 + 1e-3 * np.trace(tensor) * np.eye(3)
     if not (volume > 0 and np.linalg.eigvalsh(tensor)[0] > 0):

@@ -13,8 +13,12 @@ The whole hand's force on anything is limited as well: where the actuators toget
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
 
 TIPS = (4, 8, 12, 16, 20)
 FINGERS = ((1, 2, 3, 4), (5, 6, 7, 8), (9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
@@ -64,7 +68,7 @@ class PointsHand:
         """N s/m, critical for one sphere."""
         return 2.0 * float(np.sqrt(self.stiffness * self.mass))
 
-    def attach(self, spec: object) -> None:
+    def attach(self, spec: mujoco.MjSpec) -> None:
         """Add the spheres' bodies (``hand0`` ...), slides and actuators to an MjSpec."""
         import mujoco
 
@@ -89,7 +93,7 @@ class PointsHand:
                 actuator.forcerange = [-self.sphere_force, self.sphere_force]
                 actuator.forcelimited = 1
 
-    def bind(self, model: object) -> PointsController:
+    def bind(self, model: mujoco.MjModel) -> PointsController:
         return PointsController(self, model)
 
 
@@ -102,7 +106,7 @@ class PointsController:
         geoms: (S,) ids of the spheres.  tip_geoms: (5,).
     """
 
-    def __init__(self, hand: PointsHand, model: object) -> None:
+    def __init__(self, hand: PointsHand, model: mujoco.MjModel) -> None:
         self.hand = hand
         self.weights = sphere_weights()
         names = [f"hand{i}" for i in range(len(self.weights))]
@@ -113,13 +117,13 @@ class PointsController:
         self.act = np.array([[model.actuator(f"{n}_{a}").id for a in "xyz"] for n in names])
         self.lead = hand.damping / hand.stiffness
 
-    def place(self, data: object, joints: np.ndarray, velocity: np.ndarray | None = None) -> None:
+    def place(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> None:
         """Put the hand at landmarks (21, 3) m, moving at velocity (21, 3) m/s, and its targets there too."""
         data.qpos[self.qpos] = self.weights @ joints
         data.qvel[self.dof] = 0.0 if velocity is None else self.weights @ velocity
         data.ctrl[self.act] = self.weights @ joints
 
-    def control(self, data: object, joints: np.ndarray) -> None:
+    def control(self, data: mujoco.MjData, joints: np.ndarray) -> None:
         """Aim at landmarks (21, 3) m within the limit of the whole hand's force."""
         target = self.weights @ joints
         here = data.qpos[self.qpos]
@@ -132,6 +136,6 @@ class PointsController:
             target = here + (pull + self.hand.damping * data.qvel[self.dof]) / self.hand.stiffness
         data.ctrl[self.act] = target
 
-    def landmarks(self, data: object) -> np.ndarray:
+    def landmarks(self, data: mujoco.MjData) -> np.ndarray:
         """(21, 3) where the landmarks are, m, asset frame; a copy."""
         return data.qpos[self.qpos[:21]].copy()
