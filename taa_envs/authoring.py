@@ -231,6 +231,10 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
     limits = (float(limits[0]), float(limits[1]))
     if not (np.isfinite(limits).all() and limits[0] < limits[1]):
         raise AssetError(f"joint range {limits} is empty")
+    slack = 1e-6 * (limits[1] - limits[0])
+    if min(demo["q_start"], demo["q_demo_end"]) < limits[0] - slack or (
+            max(demo["q_start"], demo["q_demo_end"]) > limits[1] + slack):
+        raise AssetError(f"joint range {limits} does not hold the demonstration's start and end; widen it")
 
     if mass is not None and not (math.isfinite(mass) and mass > 0):
         raise AssetError(f"mass must be positive, is {mass}")

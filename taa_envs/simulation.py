@@ -25,8 +25,8 @@ class HandPath:
 
     def at(self, t: float) -> np.ndarray:
         """(21, 3) m at time t, s."""
-        i = int(np.clip(np.searchsorted(self.time, t) - 1, 0, len(self.time) - 2))
-        w = float(np.clip((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 0.0, 1.0))
+        i = min(max(int(self.time.searchsorted(t)) - 1, 0), len(self.time) - 2)
+        w = min(max((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 0.0), 1.0)
         return (1 - w) * self.joints[i] + w * self.joints[i + 1]
 
 
@@ -109,9 +109,9 @@ class Simulation:
 
     def _touching(self) -> tuple[bool, float]:
         """Whether the hand pushes on the moving link, and how deep they overlap, m."""
-        contact = self.data.contact
-        if not len(contact.dist):
+        if not self.data.ncon:
             return False, 0.0
+        contact = self.data.contact
         pairs = contact.geom
         on_link = (self.scene.moving_geoms[pairs].any(axis=1) & self.scene.hand_geoms[pairs].any(axis=1)
                    & (contact.efc_address >= 0))

@@ -126,14 +126,13 @@ class PointsController:
     def control(self, data: mujoco.MjData, joints: np.ndarray) -> None:
         """Aim at landmarks (21, 3) m within the limit of the whole hand's force."""
         target = self.weights @ joints
-        here = data.qpos[self.qpos]
-        pull = self.hand.stiffness * (target - here) - self.hand.damping * data.qvel[self.dof]
-        total = float(np.linalg.norm(np.clip(pull, -self.hand.sphere_force, self.hand.sphere_force), axis=1).sum())
+        here, drag = data.qpos[self.qpos], self.hand.damping * data.qvel[self.dof]
+        limit = self.hand.sphere_force
+        pull = np.minimum(np.maximum(self.hand.stiffness * (target - here) - drag, -limit), limit)
+        total = float(np.sqrt(np.einsum("ij,ij->i", pull, pull)).sum())
         # In free motion the pull only carries the spheres' own mass; it counts against the limit all the same.
         if total > self.hand.total_force:
-            share = self.hand.total_force / total
-            pull = np.clip(pull, -self.hand.sphere_force, self.hand.sphere_force) * share
-            target = here + (pull + self.hand.damping * data.qvel[self.dof]) / self.hand.stiffness
+            target = here + (pull * (self.hand.total_force / total) + drag) / self.hand.stiffness
         data.ctrl[self.act] = target
 
     def landmarks(self, data: mujoco.MjData) -> np.ndarray:
