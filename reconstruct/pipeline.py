@@ -1,0 +1,373 @@
+"""Video -> asset: the stages in order, each one function, each resumable from the scene folder."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from reconstruct import cues_io
+from reconstruct.cues import HandReference, Hands, LinkMasks, ProviderInfo, Tracks
+from reconstruct.errors import Refused, TaaError
+from reconstruct.export import joint_object, plain, refused_joint, write_asset
+from reconstruct.geometry import Geometry
+from reconstruct.joint.models import JointFit
+from reconstruct.store import load_stage, save_stage, stage_key
+from reconstruct.video import Video, load_video
+from taa_envs.files import written_whole
+
+if TYPE_CHECKING:
+    from taa_envs.asset import Asset
+
+
+class Progress(Protocol):
+    """What is told about a run, one stage after another."""
+
+    def start(self, stage: str) -> None: ...
+    def update(self, share: float) -> None: ...
+    def finish(self, seconds: float, note: str = "") -> None: ...
+
+
+class Silent:
+    """No progress."""
+
+    def start(self, stage: str) -> None: ...
+    def update(self, share: float) -> None: ...
+    def finish(self, seconds: float, note: str = "") -> None: ...
+
+
+@dataclass(frozen=True)
+class ReconstructResult:
+    """What came of a video.
+
+    Attributes:
+        id: the asset's id.  asset: None where the answer is a refusal.
+        joint: the contract's joint object.  replay: the contract's replay object, or None.
+        seconds: per stage.  notes: what a user should know.
+        error: "what is wrong; what to do" of a refusal.
+    """
+
+    id: str
+    asset: Asset | None
+    joint: dict
+    replay: dict | None
+    seconds: dict[str, float]
+    notes: tuple[str, ...] = ()
+    error: str | None = None
+
+    def as_dict(self) -> dict:
+        """The contract's object, plain types only."""
+        return plain({"id": self.id, "asset": str(self.asset.path) if self.asset else None, "joint": self.joint,
+                      "replay": self.replay, "seconds": self.seconds, "notes": list(self.notes)})  # fmt: skip
+
+
+@dataclass
+class Stages:
+    """Runs stages: times them, tells their progress, and takes results that are still valid from the scene folder.
+
+    Attributes:
+        folder: ``scene/stages``, or None to keep nothing.
+        inputs: what every stage depends on (the video's digest).
+        keys: the key of each stage that has run; a stage depends on all before it.
+    """
+
+    folder: Path | None
+    progress: Progress
+    inputs: dict[str, Any] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def run(self, name: str, make: Callable[[], Any], code: tuple[str, ...] = (), keep: bool = True,
+            options: Mapping[str, Any] | None = None, given: str | None = None) -> Any:  # fmt: skip
+        """Result of one stage.
+
+        Args:
+            name: of the stage.  make: computes it.
+            code: source files and packages of ``reconstruct`` that compute it.
+            keep: save it in the scene folder.
+            options: what else it depends on, JSON-ready.
+            given: digest of the user's cue that makes it; not saved again, named in the progress.
+        """
+        begin = time.monotonic()
+        self.progress.start(name)
+        key = stage_key(name, code, {**self.inputs, "before": dict(self.keys), "options": dict(options or {}),
+                                     "given": given})  # fmt: skip
+        file = self.folder / f"{name}.npz" if self.folder and keep and not given else None
+        value = load_stage(file, key) if file else None
+        note = "from the scene folder" if value is not None else "your cue" if given else ""
+        if value is None:
+            value = make()
+            if file:
+                save_stage(file, key, value)
+        self.keys[name] = key
+        self.seconds[name] = time.monotonic() - begin
+        self.progress.finish(self.seconds[name], note)
+        return value
+
+
+@dataclass(frozen=True)
+class Seen:
+    """All that was found in one video up to the joint."""
+
+    video: Video
+    hands: Hands
+    tracks: Tracks
+    fit: JointFit
+    providers: tuple[ProviderInfo, ...]
+    notes: tuple[str, ...]
+    focal_given: bool
+
+
+def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None, out: str | Path | None = None,
+                focal: float | None = None, providers: Mapping[str, str] | None = None, overwrite: bool = False,
+                seed: int = 0, progress: Progress | None = None) -> ReconstructResult:  # fmt: skip
+    """One video of a hand moving an articulated object, as an asset folder.
+
+    Args:
+        video_path: the video.
+        id: of the asset, ``[a-z0-9][a-z0-9_-]{0,63}``.
+        scene: folder that keeps cues and results; a second run takes from it what is still valid.
+        out: folder of assets, default the user's data folder.
+        focal: focal length of the upright full-size frame, px.
+        providers: cue ("hand", "track", ...) -> name of a provider.
+        overwrite: replace an asset of that id.
+        seed: of everything that draws.
+        progress: told about every stage.
+
+    Returns:
+        The asset with its joint and replay, or a refusal with its reason.
+
+    Raises:
+        TaaError, taa_envs.TaaEnvsError: the request cannot be met (no such file, id taken, ...).
+    """
+    from reconstruct.providers.table import choose
+    from taa_envs.asset import AssetExists, check_id
+    from taa_envs.registry import user_folder
+
+    check_id(id)
+    chosen = choose(providers)
+    if focal is not None and not 1.0 <= focal <= 1e6:
+        raise TaaError(f"a focal length of {focal:g} px is not possible; give it in pixels of the full-size frame")
+    root = Path(out) if out is not None else user_folder()
+    final = root / id
+    if final.exists() and not overwrite:
+        raise AssetExists(f"{final} exists; choose another id or replace it with --overwrite")
+    scene = Path(scene) if scene is not None else None
+    stages = Stages(scene / "stages" if scene else None, progress or Silent(), {"seed": seed, "providers": chosen})
+    with tempfile.TemporaryDirectory(prefix="taa-") as scratch:
+        return _reconstruct(Path(video_path), id, scene, final, focal, overwrite, seed, stages, Path(scratch))
+
+
+def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: float | None, overwrite: bool, seed: int,
+                 stages: Stages, scratch: Path) -> ReconstructResult:  # fmt: skip
+    from reconstruct.report import refusal_report
+
+    video, seen = None, None
+    try:
+        video = stages.run("video", lambda: load_video(path, scratch, progress=stages.progress.update), keep=False)
+        seen = look(video, scene, focal, seed, stages, scratch)
+        if seen.fit.verdict == "refused":
+            raise Refused(with_advice(seen.fit.reason))
+    except Refused as refusal:
+        fit = seen.fit if seen is not None else None
+        joint = joint_object(fit, video.index) if fit is not None and video is not None else refused_joint(str(refusal))
+        notes = seen.notes if seen is not None else video.notes if video is not None else ()
+        if scene is not None:
+            scene.mkdir(parents=True, exist_ok=True)
+            page = refusal_report(
+                id, path, video, seen and seen.hands, seen and seen.tracks, fit, str(refusal), notes, stages.seconds
+            )
+            with written_whole(scene / "report.html") as partial:
+                partial.write_text(page, encoding="utf-8")
+        return ReconstructResult(id, None, joint, None, stages.seconds, notes, str(refusal))
+    return _build(id, scene, final, overwrite, seen, stages)
+
+
+def with_advice(reason: str) -> str:
+    """A refusal's reason as "what is wrong; what to do"."""
+    if ";" in reason:
+        return reason
+    return f"{reason.rstrip('.')}; film one part that moves on a fixed joint, slowly and over a large range"
+
+
+def look(video: Video, scene: Path | None, focal: float | None, seed: int, stages: Stages, scratch: Path) -> Seen:
+    """The stages from pixels to the joint: camera, hands, tracks, joint, scale."""
+    from reconstruct.motion import stabilise
+    from reconstruct.providers.lk_tracks import track_points
+    from reconstruct.providers.mediapipe_hand import detect_hands
+
+    folder = cues_io.CueFolder(scene) if scene is not None else None
+    given = folder.given() if folder else {}
+    camera = folder.read("camera", "K") if folder and "camera" in given else None
+    stages.inputs.update(video=video.sha256, frames=[len(video), *video.frames.shape[1:3]], camera=given.get("camera"))
+    if folder:
+        folder.write("frames", {"time": video.time})
+        cues_io.save_facts(scene, video)
+
+    stable, _ = stages.run("camera", lambda: stabilise(video, scratch, seed), ("motion.py",), keep=False)
+    notes = list(dict.fromkeys([*video.notes, *stable.notes]))
+
+    def find_hands() -> Hands:
+        if folder is None or "hand" not in given:
+            return detect_hands(stable, stages.progress.update)
+        mask = None
+        if "masks" in given:
+            mask = cues_io.mask_at_work_size(folder.read("masks", "hand")["hand"], stable, "hand")
+        return cues_io.hands_from_cue(folder.read("hand", *cues_io.HAND_ARRAYS), camera, stable, mask)
+
+    hands = stages.run(
+        "hands",
+        find_hands,
+        ("providers/mediapipe_hand.py", "providers/skin.py"),
+        given=given.get("hand") and given["hand"] + given.get("masks", ""),
+    )
+    if not hands.tracks:
+        notes.append("no hand was seen; lengths are not metric and the replay has no hand to drive the part")
+
+    def follow() -> Tracks:
+        if folder is None or "tracks" not in given:
+            return track_points(stable, hands, progress=stages.progress.update)
+        return cues_io.tracks_from_cue(folder.read("tracks", "uv", "visible"), len(stable))
+
+    tracks = stages.run("tracks", follow, ("providers/lk_tracks.py",), given=given.get("tracks"))
+    if folder:
+        folder.write("tracks", cues_io.track_arrays(tracks))
+    fit, words = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
+    if folder and fit.verdict != "refused":
+        folder.write("camera", cues_io.camera_arrays(fit, len(stable)))
+    makers = tuple(dict.fromkeys([hands.provider, tracks.provider]))
+    return Seen(stable, hands, tracks, fit, makers, (*notes, *words), focal is not None or camera is not None)
+
+
+def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,
+           folder: cues_io.CueFolder | None, given: Mapping[str, str], seed: int,
+           stages: Stages) -> tuple[JointFit, list[str]]:  # fmt: skip
+    """The joint, metric where a scale is known, in the world of the user's camera where there is one; and notes."""
+    from reconstruct.depth import depth_scale
+    from reconstruct.hand.scale import hand_scale
+    from reconstruct.joint.fit import fit_joint
+
+    notes: list[str] = []
+    if focal is None and camera is not None:
+        focal = cues_io.focal_of(camera)
+    if focal is None:
+        focal = video.focal_px
+
+    def find() -> JointFit:
+        return fit_joint(video, tracks, focal, seed, stages.progress.update)
+
+    fit: JointFit = stages.run("joint", find, ("joint",), options={"focal": focal})
+    if fit.verdict == "refused":
+        return fit, notes
+
+    def scaled() -> JointFit:
+        if folder is not None and "depth" in given:
+            cue = folder.read("depth", "depth")
+            if bool(cue.get("metric", np.array(True))):
+                depth = cues_io.expect_shape(cue["depth"], (len(video), None, None), "depth of cues/depth.npz")
+                return depth_scale(fit, tracks, depth, video.size)
+        return fit
+
+    fit = stages.run("scale", lambda: hand_scale(scaled(), hands, video.time), ("hand", "depth.py"),
+                     options={"depth": given.get("depth")})  # fmt: skip
+    if "depth" in given and fit.scale_source != "depth":
+        notes.append("cues/depth.npz gives no scale: it is not metric or hardly meets the part's points")
+    if camera is not None and "T_world_camera" in camera:
+        fit = cues_io.in_world_of(fit, camera)
+    return fit, notes
+
+
+def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen, stages: Stages) -> ReconstructResult:
+    """The stages from the joint to the asset: masks, geometry, hand, asset, replay, report."""
+    from reconstruct.geometry.links import build_geometry
+    from reconstruct.geometry.masks import segment_links
+    from reconstruct.hand.align import align_hand
+    from reconstruct.report import add_report
+    from taa_envs.asset import load_asset
+    from taa_envs.files import folder_written_whole
+    from taa_envs.replay import replay
+
+    video, hands, tracks, fit = seen.video, seen.hands, seen.tracks, seen.fit
+    folder = cues_io.CueFolder(scene) if scene is not None else None
+    given = folder.given() if folder else {}
+
+    def segment() -> LinkMasks:
+        if folder is None or "masks" not in given:
+            return segment_links(video, hands, tracks, fit)
+        return cues_io.masks_from_cue(folder.read("masks", "static", "moving", "hand"), video)
+
+    masks = stages.run("masks", segment, ("geometry",), given=given.get("masks"))
+    geometry: Geometry = stages.run("geometry", lambda: build_geometry(video, hands, tracks, fit, masks), ("geometry",))
+    reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
+    if folder:
+        folder.write("masks", cues_io.mask_arrays(masks))
+        folder.write("hand", cues_io.hand_arrays(reference, hands))
+        folder.write_meshes(geometry)
+    notes = list(dict.fromkeys([*seen.notes, *geometry.notes, *reference.notes]))
+    if not fit.metric:
+        notes.append("no metric source; one unit of length is the moving part's median depth, taken as one metre")
+    if fit.verdict == "ambiguous":
+        notes.append(f"the joint type is not certain: {fit.reason}")
+
+    # The folder is made under a hidden name; it takes its own only when the report is in it too.
+    with folder_written_whole(final, overwrite) as work:
+
+        def save() -> Asset:
+            work.rmdir()
+            return write_asset(
+                work.parent, id, video, fit, geometry, reference, seen.providers, notes, seen.focal_given
+            )
+
+        asset = stages.run("asset", save, keep=False)
+        result = stages.run("replay", lambda: replay(asset), keep=False)
+        notes += [n for n in result.notes if n not in notes]
+        if result.joint_progress < 0.5 and result.contact_fraction < 0.5:
+            notes.append("contact does not drive the part in the replay: see the table of the replay")
+        stages.run("report", lambda: add_report(asset, video, hands, tracks, fit, masks, geometry, reference, result,
+                                                notes, stages.seconds), keep=False)  # fmt: skip
+    asset = load_asset(final, check_model=False)
+    if scene is not None:
+        with written_whole(scene / "report.html") as partial:
+            partial.write_bytes((final / "report.html").read_bytes())
+    return ReconstructResult(id, asset, joint_object(fit, video.index), result.as_dict(), stages.seconds, tuple(notes))
+
+
+def fit_scene(scene: str | Path, focal: float | None = None, seed: int = 0, progress: Progress | None = None) -> dict:
+    """The articulation alone, from the cues of a scene folder; no pixel is read.
+
+    Args:
+        scene: a folder with ``cues/tracks.npz``. The picture's size and the times come from an earlier run's
+            ``scene.json`` or from the cues; the scale from ``cues/depth.npz`` or the hand, where there is one.
+        focal: focal length of the upright full-size frame, px.
+
+    Returns:
+        The contract's joint object.
+
+    Raises:
+        TaaError: there is no such folder, or a cue that is needed is missing.
+    """
+    scene = Path(scene)
+    if not scene.is_dir():
+        raise TaaError(f"no such folder: {scene}; give the scene folder of `taa reconstruct --scene`")
+    folder = cues_io.CueFolder(scene)
+    if not (folder.folder / "tracks.npz").is_file():
+        raise TaaError(f"{scene} has no cues/tracks.npz; run `taa reconstruct --scene` first or put tracks there")
+    video = cues_io.video_of_cues(scene)
+    given = folder.given()
+    tracks = cues_io.tracks_from_cue(folder.read("tracks", "uv", "visible"), len(video))
+    camera = folder.read("camera", "K") if "camera" in given else None
+    if "hand" in given:
+        nothing = np.zeros(video.frames.shape[:3], bool)
+        hands = cues_io.hands_from_cue(folder.read("hand", *cues_io.HAND_ARRAYS), camera, video, nothing)
+    else:
+        found = load_stage(scene / "stages" / "hands.npz", None)
+        nobody = Hands((), np.zeros((len(video), 1, 1), bool), cues_io.GIVEN)
+        hands = found if isinstance(found, Hands) and found.mask.shape[0] == len(video) else nobody
+    stages = Stages(None, progress or Silent())
+    fit, _ = _joint(video, hands, tracks, focal, camera, folder, given, seed, stages)
+    return joint_object(fit, video.index)
