@@ -6,7 +6,8 @@ import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from reconstruct.synth.clips import FRAME_RATE, animate, build_clip, list_clips
+from reconstruct.synth.animation import FRAME_RATE, animate
+from reconstruct.synth.clips import build_clip, list_clips
 from reconstruct.synth.truth import SynthTruth, load_truth, write_cues
 
 __all__ = ["SynthTruth", "list_clips", "load_truth", "render_clip", "render_clips", "write_cues"]
@@ -14,8 +15,9 @@ __all__ = ["SynthTruth", "list_clips", "load_truth", "render_clip", "render_clip
 DEFAULT_SIZE = (960, 540)
 
 
-def render_clip(name: str, out: str | Path, seed: int = 0, frames: int | None = None,
-                size: tuple[int, int] | None = None) -> Path:
+def render_clip(
+    name: str, out: str | Path, seed: int = 0, frames: int | None = None, size: tuple[int, int] | None = None
+) -> Path:
     """Render one clip and its ground truth.
 
     Args:
@@ -55,8 +57,14 @@ def render_clip(name: str, out: str | Path, seed: int = 0, frames: int | None = 
     return folder
 
 
-def render_clips(out: str | Path, names: Iterable[str] | None = None, seed: int = 0, frames: int | None = None,
-                 size: tuple[int, int] | None = None, progress: Callable[[str], None] | None = None) -> dict[str, Path]:
+def render_clips(
+    out: str | Path,
+    names: Iterable[str] | None = None,
+    seed: int = 0,
+    frames: int | None = None,
+    size: tuple[int, int] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Path]:
     """Render several clips, all by default; ``progress`` is called with each name before it is rendered.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What the clips show: an object, a hand that holds it somewhere, a camera, and how all three move."""
+"""What the clips show: an object, a hand that touches it somewhere, and a camera."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from scipy.spatial.transform import Rotation
 from reconstruct.synth import objects
 from reconstruct.synth.hand_model import RADII, THUMB_RADII, HandPose, landmarks
 from reconstruct.synth.objects import Model
-
-FRAME_RATE = 30.0
 
 
 @dataclass(frozen=True)
@@ -49,25 +47,8 @@ class Clip:
     free_path: Callable[[float], np.ndarray] | None = None
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Every frame's state.
-
-    Attributes:
-        time (T,) s; q (T,) rad or m (NaN without a joint); contact (T,) bool.
-        T_world_moving (T, 4, 4): the moving link relative to its place at frame 0.
-        T_world_hand (T, 4, 4); T_camera_world (T, 4, 4).
-    """
-
-    time: np.ndarray
-    q: np.ndarray
-    contact: np.ndarray
-    T_world_moving: np.ndarray
-    T_world_hand: np.ndarray
-    T_camera_world: np.ndarray
-
-
-def _pose(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+def pose_matrix(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """(4, 4) from a rotation and a translation."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
@@ -78,9 +59,16 @@ def skin_radii() -> np.ndarray:
     return np.concatenate([[0.018], THUMB_RADII, RADII.reshape(-1)])
 
 
-def place_hand(pose: HandPose, side: str, palm: np.ndarray, fingers: np.ndarray, anchor: np.ndarray,
-               anchor_joints: tuple[int, ...], surface: tuple[np.ndarray, np.ndarray],
-               touching: tuple[int, ...]) -> np.ndarray:
+def place_hand(
+    pose: HandPose,
+    side: str,
+    palm: np.ndarray,
+    fingers: np.ndarray,
+    anchor: np.ndarray,
+    anchor_joints: tuple[int, ...],
+    surface: tuple[np.ndarray, np.ndarray],
+    touching: tuple[int, ...],
+) -> np.ndarray:
     """(4, 4) world pose of a hand that touches a plane.
 
     Args:
@@ -99,22 +87,43 @@ def place_hand(pose: HandPose, side: str, palm: np.ndarray, fingers: np.ndarray,
     point, normal = surface
     gap = ((joints + t - point) @ normal - skin_radii())[list(touching)].min()
     # Skin gives way: the touching finger is pressed in by half a millimetre.
-    return _pose(R, t - (gap + 0.0005) * normal)
+    return pose_matrix(R, t - (gap + 0.0005) * normal)
 
 
 def _demo(seed: int) -> Clip:
     model = objects.cupboard(seed)
     # Flat fingers whose pads and not the palm meet the door; the wrist is bent back.
-    pose = HandPose(flex=((14, 16, 10), (14, 16, 10), (14, 16, 10), (16, 18, 10)), spread=(12, 1, -9, -21),
-                    thumb=(50, 14, 12, 10), wrist=(48, 0))
+    pose = HandPose(
+        flex=((14, 16, 10), (14, 16, 10), (14, 16, 10), (16, 18, 10)),
+        spread=(12, 1, -9, -21),
+        thumb=(50, 14, 12, 10),
+        wrist=(48, 0),
+    )
     out = np.array([0.0, -1, 0])
-    T = place_hand(pose, "right", -out, np.array([-0.28, 0.14, 0.95]), np.array([0.085, 0, 0.585]), (12,),
-                   (np.array([0, -0.020, 0.0]), out), tuple(range(21)))
+    T = place_hand(
+        pose,
+        "right",
+        -out,
+        np.array([-0.28, 0.14, 0.95]),
+        np.array([0.085, 0, 0.585]),
+        (12,),
+        (np.array([0, -0.020, 0.0]), out),
+        tuple(range(21)),
+    )
     opened = model.link_pose(np.radians(-75.0))
     turn = opened[:3, :3]
-    return Clip("demo", "a wall cupboard's door is pushed shut", model, pose, "right", opened @ T,
-                turn @ np.array([0.06, -0.20, -0.16]), turn @ np.array([0.0, -0.10, 0.0]),
-                np.array([-0.56, -0.86, 0.62]), np.array([-0.02, -0.06, 0.50]))
+    return Clip(
+        "demo",
+        "a wall cupboard's door is pushed shut",
+        model,
+        pose,
+        "right",
+        opened @ T,
+        turn @ np.array([0.06, -0.20, -0.16]),
+        turn @ np.array([0.0, -0.10, 0.0]),
+        np.array([-0.56, -0.86, 0.62]),
+        np.array([-0.02, -0.06, 0.50]),
+    )
 
 
 def _demo_handheld(seed: int) -> Clip:
@@ -122,7 +131,12 @@ def _demo_handheld(seed: int) -> Clip:
 
 
 def _hook(first: float, second: float, third: float, wrist: tuple[float, float]) -> HandPose:
-    flex = ((first - 2, second, third), (first, second, third), (first + 1, second, third), (first + 3, second - 2, third))
+    flex = (
+        (first - 2, second, third),
+        (first, second, third),
+        (first + 1, second, third),
+        (first + 3, second - 2, third),
+    )
     return HandPose(flex=flex, spread=(7, 1, -5, -12), thumb=(44, 4, 8, 12), wrist=wrist)
 
 
@@ -131,66 +145,161 @@ def _pull(pose: HandPose, rise: float, plate: np.ndarray) -> np.ndarray:
     a = np.radians(rise)
     fingers, palm = np.array([0, np.cos(a), np.sin(a)]), np.array([0, np.sin(a), -np.cos(a)])
     joints = (6, 7, 10, 11, 14, 15, 18, 19)
-    return place_hand(pose, "right", palm, fingers, plate + [0.015, 0.009, 0.004], joints, (plate, np.array([0.0, 1, 0])),
-                      (6, 7, 8, 10, 11, 12, 14, 15, 16, 18, 19, 20))
+    return place_hand(
+        pose,
+        "right",
+        palm,
+        fingers,
+        plate + [0.015, 0.009, 0.004],
+        joints,
+        (plate, np.array([0.0, 1, 0])),
+        (6, 7, 8, 10, 11, 12, 14, 15, 16, 18, 19, 20),
+    )
 
 
 def _drawer(seed: int) -> Clip:
     model = objects.drawers(seed)
-    pose = _hook(45, 53, 4, (4, 0))
+    pose = _hook(45, 53, 4, (4, 20))
     T = _pull(pose, 10, np.array([0.0, -0.064, 0.2635]))
-    return Clip("drawer", "a drawer is pulled out by its handle", model, pose, "right", T, np.array([0.05, -0.22, 0.10]),
-                np.array([0.0, 0.0, 0.07]), np.array([-0.38, -0.80, 0.72]), np.array([0.0, -0.06, 0.20]))
+    return Clip(
+        "drawer",
+        "a drawer is pulled out by its handle",
+        model,
+        pose,
+        "right",
+        T,
+        np.array([0.05, -0.22, 0.10]),
+        np.array([0.0, 0.0, 0.10]),
+        np.array([-0.26, -0.72, 0.66]),
+        np.array([0.01, -0.10, 0.19]),
+    )
 
 
 def _laptop(seed: int) -> Clip:
     model = objects.laptop(seed)
-    pose = HandPose(flex=((12, 14, 8), (12, 14, 8), (12, 14, 8), (14, 16, 8)), spread=(11, 1, -8, -19),
-                    thumb=(52, 8, 10, 8), wrist=(16, 0))
+    pose = HandPose(
+        flex=((12, 14, 8), (12, 14, 8), (12, 14, 8), (14, 16, 8)),
+        spread=(11, 1, -8, -19),
+        thumb=(52, 8, 10, 8),
+        wrist=(0, 0),
+        arm=0.95,
+    )
     up = np.array([0.0, 0, 1])
-    T = place_hand(pose, "right", -up, np.array([0.12, -0.97, -0.10]), np.array([0.02, 0.115, 0.03]), (12,),
-                   (np.array([0, 0, 0.030]), up), tuple(range(21)))
+    T = place_hand(
+        pose,
+        "right",
+        -up,
+        np.array([0.12, -0.97, -0.10]),
+        np.array([0.02, 0.115, 0.03]),
+        (12,),
+        (np.array([0, 0, 0.030]), up),
+        tuple(range(21)),
+    )
     opened = model.link_pose(np.radians(-100.0))
-    return Clip("laptop", "a laptop's lid is pushed shut from behind", model, pose, "right", opened @ T,
-                np.array([0.10, -0.16, 0.14]), np.array([0.0, -0.08, 0.02]), np.array([-0.34, -0.62, 0.58]),
-                np.array([0.0, 0.04, 0.11]))
+    return Clip(
+        "laptop",
+        "a laptop's lid is pushed shut from behind",
+        model,
+        pose,
+        "right",
+        opened @ T,
+        np.array([0.10, -0.16, 0.14]),
+        np.array([0.0, -0.08, 0.02]),
+        np.array([-0.28, -0.60, 0.42]),
+        np.array([0.01, 0.04, 0.13]),
+    )
 
 
 def _oven(seed: int) -> Clip:
     model = objects.oven(seed)
-    pose = _hook(25, 38, 3, (8, 0))
-    T = _pull(pose, -25, np.array([0.0, -0.066, 0.262]))
-    return Clip("oven", "an oven's door is pulled open downwards", model, pose, "right", T, np.array([0.08, -0.18, 0.14]),
-                np.array([0.0, 0.0, 0.07]), np.array([-0.46, -0.86, 0.66]), np.array([0.0, -0.10, 0.17]))
+    pose = _hook(34, 45, 3, (8, 20))
+    T = _pull(pose, -8, np.array([0.0, -0.066, 0.262]))
+    return Clip(
+        "oven",
+        "an oven's door is pulled open downwards",
+        model,
+        pose,
+        "right",
+        T,
+        np.array([0.08, -0.18, 0.14]),
+        np.array([0.0, 0.0, 0.10]),
+        np.array([-0.30, -0.74, 0.72]),
+        np.array([0.01, -0.12, 0.17]),
+    )
 
 
 def _lifted(s: float) -> np.ndarray:
     R = Rotation.from_rotvec(np.radians([28 * s, -22 * s * s, 55 * s * (1 - 0.4 * s)])).as_matrix()
-    return _pose(R, np.array([0.11 * s * s, -0.07 * np.sin(np.pi * s), 0.17 * s * (1.5 - 0.5 * s)]))
+    return pose_matrix(R, np.array([0.11 * s * s, -0.07 * np.sin(np.pi * s), 0.17 * s * (1.5 - 0.5 * s)]))
 
 
 def _lift(seed: int) -> Clip:
     model = objects.parcel(seed)
-    pose = HandPose(flex=((46, 30, 14), (48, 30, 14), (48, 30, 14), (46, 30, 14)), spread=(10, 1, -8, -18),
-                    thumb=(58, 50, -6, 8), wrist=(6, 0))
+    pose = HandPose(
+        flex=((46, 30, 14), (48, 30, 14), (48, 30, 14), (46, 30, 14)),
+        spread=(10, 1, -8, -18),
+        thumb=(58, 50, -6, 8),
+        wrist=(6, 0),
+    )
     y = np.array([0.0, 1, 0])
-    T = place_hand(pose, "right", np.array([0, -0.12, -1.0]), np.array([0, 1, -0.12]), np.array([0.0, 0.05, 0.072]),
-                   (8, 12, 16, 20), (np.array([0, 0.05, 0.0]), y), (7, 8, 11, 12, 15, 16, 19, 20))
-    return Clip("lift", "a parcel is lifted freely away: no joint", model, pose, "right", T, np.array([0.05, -0.14, 0.16]),
-                np.array([0.0, 0.0, 0.09]), np.array([-0.30, -0.66, 0.66]), np.array([0.03, 0.0, 0.12]),
-                free_path=_lifted)
+    T = place_hand(
+        pose,
+        "right",
+        np.array([0, -0.12, -1.0]),
+        np.array([0, 1, -0.12]),
+        np.array([0.0, 0.05, 0.072]),
+        (8, 12, 16, 20),
+        (np.array([0, 0.05, 0.0]), y),
+        (7, 8, 11, 12, 15, 16, 19, 20),
+    )
+    return Clip(
+        "lift",
+        "a parcel is lifted freely away: no joint",
+        model,
+        pose,
+        "right",
+        T,
+        np.array([0.05, -0.14, 0.16]),
+        np.array([0.0, 0.0, 0.09]),
+        np.array([-0.24, -0.62, 0.56]),
+        np.array([0.03, 0.0, 0.14]),
+        free_path=_lifted,
+    )
 
 
 def _still(seed: int) -> Clip:
     clip = _drawer(seed)
-    pose = replace(clip.pose, flex=((12, 14, 8),) * 4, spread=(12, 1, -9, -20))
-    return replace(clip, name="still", story="a hand waves in front of a chest; nothing else moves", pose=pose,
-                   T_world_hand=clip.T_world_hand @ _pose(Rotation.from_euler("x", 50, degrees=True).as_matrix(), np.zeros(3)),
-                   far=np.array([0.10, -0.24, 0.08]), near=np.array([-0.06, -0.12, 0.10]), touches=False)
+    pose = HandPose(wrist=(55, 0))
+    out = np.array([0.0, -1, 0])
+    T = place_hand(
+        pose,
+        "right",
+        -out,
+        np.array([-0.5, 0.0, 0.85]),
+        np.array([0.05, 0, 0.30]),
+        (9,),
+        (np.array([0, -0.14, 0.0]), out),
+        tuple(range(21)),
+    )
+    return replace(
+        clip,
+        name="still",
+        story="a hand waves in front of a chest; nothing else moves",
+        pose=pose,
+        T_world_hand=T,
+        far=np.array([0.14, -0.16, -0.02]),
+        near=np.array([0.06, -0.04, 0.0]),
+        touches=False,
+    )
 
 
 _BUILDERS: dict[str, Callable[[int], Clip]] = {
-    "demo": _demo, "drawer": _drawer, "laptop": _laptop, "oven": _oven, "lift": _lift, "still": _still,
+    "demo": _demo,
+    "drawer": _drawer,
+    "laptop": _laptop,
+    "oven": _oven,
+    "lift": _lift,
+    "still": _still,
     "demo_handheld": _demo_handheld,
 }
 
@@ -209,64 +318,3 @@ def build_clip(name: str, seed: int = 0) -> Clip:
     if name not in _BUILDERS:
         raise ValueError(f"unknown clip {name!r}; known: {', '.join(_BUILDERS)}")
     return _BUILDERS[name](seed)
-
-
-def _wander(n: int, amount: float, seconds: float, rng: np.random.Generator, rate: float) -> np.ndarray:
-    """(n, 3) smooth random motion that starts at 0."""
-    from scipy.interpolate import CubicSpline
-
-    knots = max(4, int(np.ceil(n / rate / seconds)) + 3)
-    x = CubicSpline(np.linspace(0, 1, knots), rng.normal(0, amount, (knots, 3)))(np.linspace(0, 1, n))
-    return x - x[0]
-
-
-def _ease(s: np.ndarray) -> np.ndarray:
-    """Minimum-jerk blend from 0 to 1."""
-    s = np.clip(s, 0, 1)
-    return s**3 * (10 - 15 * s + 6 * s * s)
-
-
-def look_at(camera: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(4, 4) T_camera_world of a level camera (right, down, forward)."""
-    f = (target - camera) / np.linalg.norm(target - camera)
-    r = np.cross(f, [0.0, 0, 1])
-    r /= np.linalg.norm(r)
-    R = np.stack([r, np.cross(f, r), f])
-    return _pose(R, -R @ camera)
-
-
-def animate(clip: Clip, frames: int, rate: float, seed: int) -> Motion:
-    """When everything is where: the hand arrives, rests, drives the part, rests, leaves."""
-    rng = np.random.default_rng(seed)
-    s = np.arange(frames) / max(frames - 1, 1)
-    arrive, start, end, leave = 0.20, 0.24, 0.78, 0.81
-    progress = _ease((s - start) / (end - start))
-    # A person is not a servo: the speed wavers, yet never turns back.
-    waver = 0.03 * np.sin(2 * np.pi * (2 * progress + rng.uniform()))
-    progress = np.clip(progress + (waver - waver[0]) * 4 * progress * (1 - progress), 0, 1)
-    contact = (s >= arrive) & (s <= leave) & clip.touches
-    if not clip.touches:
-        progress = np.zeros(frames)
-    if clip.free_path is not None:
-        q, T_moving = np.full(frames, np.nan), np.stack([clip.free_path(v) for v in progress])
-    else:
-        q = progress * clip.model.q_end
-        T_moving = clip.model.link_pose(q)
-    tremble, turn = _wander(frames, 0.0012, 0.4, rng, rate), _wander(frames, 0.010, 0.5, rng, rate)
-    slip = _wander(frames, 0.0004, 0.8, rng, rate)
-    away = 1 - np.where(s < 0.5, _ease(s / arrive), 1 - _ease((s - leave) / (1 - leave)))
-    T_hand = np.empty((frames, 4, 4))
-    for t in range(frames):
-        a = away[t]
-        # Quadratic curve from `far` to the contact that ends along `near`.
-        offset = a * a * clip.far + 2 * a * (1 - a) * clip.near + a * tremble[t] * 2
-        local = _pose(Rotation.from_rotvec(a * (turn[t] + [0.15, 0.0, -0.12])).as_matrix(), np.zeros(3))
-        held = clip.T_world_hand.copy()
-        held[:3, 3] += offset + slip[t] * (1 - a)
-        T_hand[t] = T_moving[t] @ held @ local
-    if not clip.touches:
-        T_hand[:, :3, 3] += (np.sin(np.pi * s) ** 2 * 0.05 * np.sin(2 * np.pi * 2.5 * s))[:, None] * np.array([1.0, 0, 0.3])
-    base = look_at(clip.camera, clip.target)
-    move, tilt = _wander(frames, clip.drift[0], 0.9, rng, rate), _wander(frames, clip.drift[1], 0.9, rng, rate)
-    T_camera = np.stack([_pose(Rotation.from_rotvec(tilt[t]).as_matrix(), move[t]) @ base for t in range(frames)])
-    return Motion(np.arange(frames) / rate, q, contact, T_moving, T_hand, T_camera)

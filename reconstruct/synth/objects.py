@@ -32,8 +32,15 @@ class Box:
     shine: float = 0.15
 
     def moved(self, T: np.ndarray) -> Box:
-        return Box(self.link, T[:3, :3] @ self.centre + T[:3, 3], self.size, self.paint, T[:3, :3] @ self.rotation,
-                   self.density, self.shine)
+        return Box(
+            self.link,
+            T[:3, :3] @ self.centre + T[:3, 3],
+            self.size,
+            self.paint,
+            T[:3, :3] @ self.rotation,
+            self.density,
+            self.shine,
+        )
 
     def corners(self) -> np.ndarray:
         """(8, 3) world."""
@@ -60,7 +67,9 @@ class Model:
     q_range: tuple[float, float]
 
     def link_pose(self, q: np.ndarray | float) -> np.ndarray:
-        """(..., 4, 4) moving link relative to q = 0."""
+        """(..., 4, 4) moving link relative to q = 0; ValueError without a joint."""
+        if self.kind is None or self.axis is None:
+            raise ValueError("nothing is attached by a joint here")
         return joint_transform(self.kind, self.axis, self.point, q)
 
     @property
@@ -85,28 +94,35 @@ def room(seed: int, wall_y: float) -> list[Box]:
     """A table top at z = 0, a tiled and plastered wall behind, and a few things that stand about."""
     rng = np.random.default_rng(seed)
     wall = tx.with_stickers(tx.plaster((0.80, 0.77, 0.70)), 22, 0.22)
-    out = [_box("room", (-3.0, -1.2, -0.04), (3.0, wall_y, 0.0), tx.wood((0.50, 0.36, 0.24), 0.22), density=400),
-           _box("room", (-3.0, wall_y, -0.1), (3.0, wall_y + 0.05, 0.30), tx.tiles((0.70, 0.76, 0.78)), density=400),
-           _box("room", (-3.0, wall_y + 0.01, 0.30), (3.0, wall_y + 0.05, 1.9), wall, density=300)]
+    out = [
+        _box("room", (-3.0, -1.2, -0.04), (3.0, wall_y, 0.0), tx.wood((0.50, 0.36, 0.24), 0.22), density=400),
+        _box("room", (-3.0, wall_y, -0.1), (3.0, wall_y + 0.05, 0.30), tx.tiles((0.70, 0.76, 0.78)), density=400),
+        _box("room", (-3.0, wall_y + 0.01, 0.30), (3.0, wall_y + 0.05, 1.9), wall, density=300),
+    ]
     for x in (-0.62, 0.60):
         z = 0.0
         for _ in range(3):
             h, w, d = rng.uniform(0.03, 0.05), rng.uniform(0.13, 0.2), rng.uniform(0.14, 0.18)
             x0, y0 = x + rng.uniform(-0.02, 0.02) - w / 2, wall_y - 0.05 - d
             colour = tuple(rng.uniform(0.2, 0.75, 3))
-            out.append(_box("room", (x0, y0, z), (x0 + w, y0 + d, z + h), tx.with_stickers(tx.paint(colour, 0.04), 2, 0.05)))
+            out.append(
+                _box("room", (x0, y0, z), (x0 + w, y0 + d, z + h), tx.with_stickers(tx.paint(colour, 0.04), 2, 0.05))
+            )
             z += h
     return out
 
 
-def _cabinet(low: np.ndarray, high: np.ndarray, wall: float, paint: tx.Painter, shelves: int = 1) -> list[Box]:
+def _cabinet(low: tuple, high: tuple, wall: float, paint: tx.Painter, shelves: int = 1) -> list[Box]:
     """An open-fronted cabinet (front at low y)."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     inner = tx.paint((0.74, 0.70, 0.62), 0.03)
-    out = [_box("static", (x0, y0, z0), (x0 + wall, y1, z1), paint), _box("static", (x1 - wall, y0, z0), (x1, y1, z1), paint),
-           _box("static", (x0 + wall, y0, z0), (x1 - wall, y1, z0 + wall), paint),
-           _box("static", (x0 + wall, y0, z1 - wall), (x1 - wall, y1, z1), paint),
-           _box("static", (x0 + wall, y1 - wall, z0 + wall), (x1 - wall, y1, z1 - wall), inner)]
+    out = [
+        _box("static", (x0, y0, z0), (x0 + wall, y1, z1), paint),
+        _box("static", (x1 - wall, y0, z0), (x1, y1, z1), paint),
+        _box("static", (x0 + wall, y0, z0), (x1 - wall, y1, z0 + wall), paint),
+        _box("static", (x0 + wall, y0, z1 - wall), (x1 - wall, y1, z1), paint),
+        _box("static", (x0 + wall, y1 - wall, z0 + wall), (x1 - wall, y1, z1 - wall), inner),
+    ]
     for k in range(shelves):
         z = z0 + (k + 1) * (z1 - z0) / (shelves + 1)
         out.append(_box("static", (x0 + wall, y0 + 0.012, z - wall / 2), (x1 - wall, y1 - wall, z + wall / 2), paint))
@@ -119,7 +135,7 @@ def cupboard(seed: int) -> Model:
     front = tx.with_stickers(tx.wood((0.66, 0.50, 0.34), 0.22, upright=True), 7, 0.065)
     boxes = room(seed, 0.24) + _cabinet((-0.18, 0.0, 0.30), (0.18, 0.24, 0.72), 0.016, body)
     boxes.append(_box("moving", (-0.18, -0.020, 0.302), (0.178, -0.002, 0.718), front, density=1400))
-    boxes.append(_box("moving", (0.135, -0.036, 0.49), (0.15, -0.020, 0.53), tx.paint((0.25, 0.25, 0.27)), shine=0.6))
+    boxes.append(_box("moving", (0.135, -0.036, 0.655), (0.15, -0.020, 0.695), tx.paint((0.25, 0.25, 0.27)), shine=0.6))
     for z in (0.42, 0.60):
         for k, colour in enumerate(((0.7, 0.3, 0.2), (0.3, 0.5, 0.35), (0.75, 0.65, 0.3))):
             x = -0.12 + 0.09 * k
@@ -127,8 +143,14 @@ def cupboard(seed: int) -> Model:
             low = (x, 0.09, 0.316 if z < 0.5 else 0.518)
             boxes.append(_box("static", low, (x + 0.06, 0.15, low[2] + 0.11), jar))
     axis, point, start = np.array([0.0, 0, 1]), np.array([-0.18, -0.002, 0.51]), np.radians(-75.0)
-    return Model(tuple(_opened(boxes, "revolute", axis, point, start)), "revolute", axis, point, np.radians(70.0),
-                 (0.0, np.radians(75.0)))
+    return Model(
+        tuple(_opened(boxes, "revolute", axis, point, start)),
+        "revolute",
+        axis,
+        point,
+        np.radians(70.0),
+        (0.0, np.radians(75.0)),
+    )
 
 
 def drawers(seed: int) -> Model:
@@ -138,7 +160,9 @@ def drawers(seed: int) -> Model:
     plain, metal = tx.paint((0.70, 0.66, 0.58), 0.03), tx.paint((0.30, 0.30, 0.32))
     x, depth, height = 0.22, 0.30, 0.34
     boxes = room(seed, depth + 0.02) + _cabinet((-x, 0.0, 0.0), (x, depth, height), 0.016, body, shelves=1)
-    boxes.append(_box("static", (-x + 0.003, -0.018, 0.004), (x - 0.003, 0.0, 0.167), tx.wood((0.55, 0.40, 0.27), 0.18)))
+    boxes.append(
+        _box("static", (-x + 0.003, -0.018, 0.004), (x - 0.003, 0.0, 0.167), tx.wood((0.55, 0.40, 0.27), 0.18))
+    )
     z0, z1 = 0.171, height - 0.004
     boxes.append(_box("moving", (-x + 0.003, -0.018, z0), (x - 0.003, -0.001, z1), front, density=1300))
     inside = 0.024
@@ -154,7 +178,9 @@ def drawers(seed: int) -> Model:
     z = 0.5 * (z0 + z1) + 0.01
     boxes.append(_box("moving", (-0.085, -0.074, z - 0.016), (0.085, -0.064, z + 0.016), metal, shine=0.6))
     for s in (-1, 1):
-        boxes.append(_box("moving", (s * 0.078 - 0.006, -0.064, z - 0.006), (s * 0.078 + 0.006, -0.018, z + 0.006), metal))
+        boxes.append(
+            _box("moving", (s * 0.078 - 0.006, -0.064, z - 0.006), (s * 0.078 + 0.006, -0.018, z + 0.006), metal)
+        )
     return Model(tuple(boxes), "prismatic", np.array([0.0, -1, 0]), None, 0.18, (0.0, 0.22))
 
 
@@ -163,36 +189,79 @@ def laptop(seed: int) -> Model:
     shell = tx.paint((0.42, 0.43, 0.46), 0.03)
     lid = tx.with_stickers(tx.paint((0.42, 0.43, 0.46), 0.03), 8, 0.055)
     w, d, base = 0.17, 0.24, 0.018
-    boxes = room(seed, 0.75) + [_box("static", (-w, 0.0, 0.004), (w, d, base), shell, shine=0.4)]
-    boxes += [_box("static", (-w + 0.02, 0.03, base), (w - 0.02, 0.14, base + 0.002), tx.tiles((0.1, 0.1, 0.1), 0.018), density=1500)]
-    boxes += [_box("static", (sx - 0.01, sy - 0.01, 0.0), (sx + 0.01, sy + 0.01, 0.004), shell) for sx in (-0.15, 0.15) for sy in (0.02, 0.22)]
+    boxes = room(seed, 1.35) + [_box("static", (-w, 0.0, 0.004), (w, d, base), shell, shine=0.4)]
+    boxes += [
+        _box(
+            "static",
+            (-w + 0.02, 0.03, base),
+            (w - 0.02, 0.14, base + 0.002),
+            tx.tiles((0.1, 0.1, 0.1), 0.018),
+            density=1500,
+        )
+    ]
+    boxes += [
+        _box("static", (sx - 0.01, sy - 0.01, 0.0), (sx + 0.01, sy + 0.01, 0.004), shell)
+        for sx in (-0.15, 0.15)
+        for sy in (0.02, 0.22)
+    ]
     boxes.append(_box("moving", (-w, 0.004, base + 0.004), (w, d, base + 0.012), lid, density=1500, shine=0.4))
     axis, point, start = np.array([1.0, 0, 0]), np.array([0.0, 0.0, base + 0.006]), np.radians(100.0)
     # Closing turns the lid about -x; q grows as it closes.
-    return Model(tuple(_opened(boxes, "revolute", axis, point, start)), "revolute", -axis, point, np.radians(90.0),
-                 (0.0, np.radians(98.0)))
+    return Model(
+        tuple(_opened(boxes, "revolute", axis, point, start)),
+        "revolute",
+        -axis,
+        point,
+        np.radians(90.0),
+        (0.0, np.radians(98.0)),
+    )
 
 
 def oven(seed: int) -> Model:
     """A table oven whose door opens downwards by 55 deg at its plate handle (horizontal hinge)."""
     body, metal = tx.paint((0.66, 0.66, 0.64), 0.03), tx.paint((0.22, 0.22, 0.24))
     front = tx.with_stickers(tx.paint((0.60, 0.60, 0.59), 0.03), 5, 0.05)
-    boxes = room(seed, 0.34) + _cabinet((-0.21, 0.0, 0.02), (0.21, 0.30, 0.36), 0.018, body)
-    boxes += [_box("static", (sx - 0.015, sy, 0.0), (sx + 0.015, sy + 0.03, 0.02), metal) for sx in (-0.18, 0.18) for sy in (0.02, 0.25)]
-    boxes.append(_box("static", (-0.21, -0.02, 0.302), (0.21, 0.0, 0.36), tx.with_stickers(body, 5, 0.045), density=1400))
+    boxes = room(seed, 0.34) + _cabinet((-0.21, 0.0, 0.02), (0.21, 0.30, 0.36), 0.018, body, shelves=0)
+    boxes += [
+        _box("static", (sx - 0.015, sy, 0.0), (sx + 0.015, sy + 0.03, 0.02), metal)
+        for sx in (-0.18, 0.18)
+        for sy in (0.02, 0.25)
+    ]
+    boxes.append(
+        _box("static", (-0.21, -0.02, 0.302), (0.21, 0.0, 0.36), tx.with_stickers(body, 5, 0.045), density=1400)
+    )
     boxes.append(_box("moving", (-0.208, -0.020, 0.024), (0.208, -0.001, 0.298), front, density=1300))
-    boxes.append(_box("moving", (-0.15, -0.0215, 0.06), (0.15, -0.020, 0.215), tx.with_stickers(tx.paint((0.10, 0.10, 0.11), 0.05), 2, 0.05), density=1300, shine=0.6))
+    boxes.append(
+        _box(
+            "moving",
+            (-0.15, -0.0215, 0.06),
+            (0.15, -0.020, 0.215),
+            tx.with_stickers(tx.paint((0.10, 0.10, 0.11), 0.05), 2, 0.05),
+            density=1300,
+            shine=0.6,
+        )
+    )
     z = 0.262
     boxes.append(_box("moving", (-0.10, -0.076, z - 0.016), (0.10, -0.066, z + 0.016), metal, shine=0.6))
     for s in (-1, 1):
-        boxes.append(_box("moving", (s * 0.094 - 0.006, -0.066, z - 0.006), (s * 0.094 + 0.006, -0.020, z + 0.006), metal))
-    return Model(tuple(boxes), "revolute", np.array([1.0, 0, 0]), np.array([0.0, -0.010, 0.024]), np.radians(55.0),
-                 (0.0, np.radians(85.0)))
+        boxes.append(
+            _box("moving", (s * 0.094 - 0.006, -0.066, z - 0.006), (s * 0.094 + 0.006, -0.020, z + 0.006), metal)
+        )
+    return Model(
+        tuple(boxes),
+        "revolute",
+        np.array([1.0, 0, 0]),
+        np.array([0.0, -0.010, 0.024]),
+        np.radians(55.0),
+        (0.0, np.radians(85.0)),
+    )
 
 
 def parcel(seed: int) -> Model:
     """A parcel that stands on a table, not attached to anything."""
     carton = tx.with_stickers(tx.paint((0.66, 0.50, 0.33), 0.05), 3, 0.055)
-    boxes = room(seed, 0.40) + [_box("moving", (-0.075, -0.05, 0.0), (0.075, 0.05, 0.10), carton, density=1500)]
-    boxes.append(_box("static", (-0.22, 0.12, 0.0), (0.24, 0.26, 0.11), tx.with_stickers(tx.wood((0.5, 0.36, 0.25)), 4, 0.06)))
+    boxes = room(seed, 0.40) + [_box("moving", (-0.055, -0.05, 0.0), (0.065, 0.05, 0.10), carton, density=1500)]
+    boxes.append(
+        _box("static", (-0.22, 0.12, 0.0), (0.24, 0.26, 0.11), tx.with_stickers(tx.wood((0.5, 0.36, 0.25)), 4, 0.06))
+    )
     return Model(tuple(boxes), None, None, None, 1.0, (0.0, 1.0))

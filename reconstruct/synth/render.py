@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reconstruct.errors import TaaError
-from reconstruct.synth.clips import Clip, Motion
+from reconstruct.synth.animation import Motion
+from reconstruct.synth.clips import Clip
 from reconstruct.synth.hand_model import HandMesh, build_hand
 from reconstruct.synth.objects import Box
 
@@ -37,28 +38,36 @@ def intrinsics(focal: float, size: tuple[int, int]) -> np.ndarray:
     return np.array([[focal * w, 0, (w - 1) / 2], [0, focal * w, (h - 1) / 2], [0, 0, 1]])
 
 
-def _box_mesh(box: Box, seed: int) -> tuple[np.ndarray, ...]:
-    """Vertices, normals, triangles, texture coordinates (one a vertex) and atlas of a finely divided box."""
-    rng = np.random.default_rng(seed)
+def _box_mesh(box: Box, seed: int, detail: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, normals, triangles, texture coordinates (one a vertex) and atlas of a finely divided box.
+
+    ``detail`` scales the texture's resolution: small pictures need no more.
+    """
+    rng, density = np.random.default_rng(seed), box.density * detail
     pictures, faces = [], []
     for axis, sign in FACES:
         # u runs right and v up when looking at the face from outside, v along z wherever there is one.
         v_axis = 2 if axis != 2 else 1
         u_axis = 3 - axis - v_axis
-        pictures.append(box.paint(*(max(4, round(box.size[m] * box.density)) for m in (v_axis, u_axis)), box.density, rng))
+        h, w = (max(4, round(box.size[m] * density)) for m in (v_axis, u_axis))
+        pictures.append(box.paint(h, w, density, rng))
         faces.append((axis, sign, u_axis, v_axis))
     height = sum(p.shape[0] + 2 for p in pictures)
     width = max(p.shape[1] for p in pictures) + 2
     atlas = np.zeros((height, width, 3), np.uint8)
-    top, V, N, F, U = 0, [], [], [], []
+    top = 0
+    V: list[np.ndarray] = []
+    N: list[np.ndarray] = []
+    F: list[np.ndarray] = []
+    U: list[np.ndarray] = []
     for picture, (axis, sign, ua, va) in zip(pictures, faces, strict=True):
         h, w = picture.shape[:2]
-        atlas[top:top + h + 2, : w + 2] = np.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
-        nu, nv = (int(np.clip(np.ceil(box.size[m] / 0.05), 1, 12)) for m in (ua, va))
+        atlas[top : top + h + 2, : w + 2] = np.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        nu, nv = (int(np.clip(np.ceil(box.size[m] / 0.05), 1, 12)) for m in (ua, va))  # lighting is by vertex
         a, b = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
         p = np.zeros((a.size, 3))
         p[:, axis] = 0.5 * sign * box.size[axis]
-        right = sign if (axis == 0) else -sign if axis == 1 else sign
+        right = -sign if axis == 1 else sign
         p[:, ua] = (a.ravel() - 0.5) * right * box.size[ua]
         p[:, va] = (b.ravel() - 0.5) * box.size[va]
         normal = np.zeros(3)
@@ -75,8 +84,8 @@ def _box_mesh(box: Box, seed: int) -> tuple[np.ndarray, ...]:
         rows = top + 1 + (1 - b.ravel()) * h
         U.append(np.stack([(1 + a.ravel() * w) / width, rows / height], axis=1))
         top += h + 2
-    V, N, F, U = (np.concatenate(x) for x in (V, N, F, U))
-    return V @ box.rotation.T, N @ box.rotation.T, F, U, atlas
+    vertices, normals = np.concatenate(V) @ box.rotation.T, np.concatenate(N) @ box.rotation.T
+    return vertices, normals, np.concatenate(F), np.concatenate(U), atlas
 
 
 def _add_mesh(spec, body, name: str, V, N, F, U, FU, picture: np.ndarray, shine: float) -> None:
@@ -87,8 +96,9 @@ def _add_mesh(spec, body, name: str, V, N, F, U, FU, picture: np.ndarray, shine:
     mesh.userface = F.astype(np.int32).ravel()
     mesh.usertexcoord, mesh.userfacetexcoord = U.astype(np.float32).ravel(), FU.astype(np.int32).ravel()
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=picture.shape[1],
-                               height=picture.shape[0], nchannel=3)
+    texture = spec.add_texture(
+        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=picture.shape[1], height=picture.shape[0], nchannel=3
+    )
     texture.data = np.ascontiguousarray(picture).tobytes()
     material = spec.add_material(name=name, specular=shine, shininess=0.25 + 0.4 * shine)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
@@ -105,29 +115,43 @@ def _scene(clip: Clip, hand: HandMesh, size: tuple[int, int], seed: int):
     spec.visual.quality.shadowsize = 2048
     spec.visual.quality.offsamples = 4
     spec.visual.map.znear, spec.visual.map.zfar = 0.02, 12.0
-    spec.visual.headlight.ambient = [0.30, 0.30, 0.31]
-    spec.visual.headlight.diffuse = [0.16, 0.16, 0.16]
+    spec.visual.headlight.ambient = [0.34, 0.34, 0.35]
+    spec.visual.headlight.diffuse = [0.20, 0.20, 0.20]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     spec.stat.extent, spec.stat.center = 1.0, clip.target
-    # A lamp of some size: shadows of neighbouring lights overlap to a soft edge.
-    lamp = clip.target + np.array([-0.55, -0.9, 1.6])
-    for offset in ((-0.06, 0, 0), (0.06, 0.04, 0), (0.0, -0.06, 0.04)):
-        at = lamp + offset
-        spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_SPOT, pos=at, dir=clip.target - at, cutoff=60, exponent=2,
-                                 diffuse=[0.20, 0.195, 0.18], specular=[0.1, 0.1, 0.1], castshadow=True)
-    spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=clip.target + [1.0, -1.0, 0.8],
-                             dir=[-0.7, 0.6, -0.4], diffuse=[0.14, 0.15, 0.17], specular=[0, 0, 0], castshadow=False)
+    # Each light with a shadow costs a pass over the scene: one lamp throws it, the others fill.
+    at = clip.target + np.array([-0.55, -0.9, 1.6])
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_SPOT,
+        pos=at,
+        dir=clip.target - at,
+        cutoff=60,
+        exponent=2,
+        diffuse=[0.52, 0.51, 0.47],
+        specular=[0.3, 0.3, 0.3],
+        castshadow=True,
+    )
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=clip.target + [1.0, -1.0, 0.8],
+        dir=[-0.7, 0.6, -0.4],
+        diffuse=[0.14, 0.15, 0.17],
+        specular=[0, 0, 0],
+        castshadow=False,
+    )
     bodies = {"room": spec.worldbody, "static": spec.worldbody}
     for name in ("moving", "hand"):
         bodies[name] = spec.worldbody.add_body(name=name, mocap=True)
     for i, box in enumerate(clip.model.boxes):
-        V, N, F, U, atlas = _box_mesh(box, seed * 1000 + i)
+        V, N, F, U, atlas = _box_mesh(box, seed * 1000 + i, min(1.0, size[0] / 960))
         _add_mesh(spec, bodies[box.link], f"{box.link}_{i}", V + box.centre, N, F, U, F, atlas, box.shine)
     quads, index = hand.quads, np.arange(4 * len(hand.quads)).reshape(-1, 4)
     F, FU = (np.concatenate([x[:, [0, 1, 2]], x[:, [0, 2, 3]]]) for x in (quads, index))
     _add_mesh(spec, bodies["hand"], "hand_0", hand.vertices, hand.normals, F, hand.texcoord, FU, hand.texture, 0.12)
     # MuJoCo cameras look along -z with y up.
-    spec.worldbody.add_camera(name="camera", fovy=float(np.degrees(2 * np.arctan(0.5 * size[1] / (clip.focal * size[0])))))
+    spec.worldbody.add_camera(
+        name="camera", fovy=float(np.degrees(2 * np.arctan(0.5 * size[1] / (clip.focal * size[0]))))
+    )
     return spec.compile()
 
 
@@ -143,7 +167,8 @@ def render(clip: Clip, motion: Motion, size: tuple[int, int], seed: int) -> Rend
     """
     import mujoco
 
-    hand = build_hand(clip.pose, clip.side, seed)
+    # No finer than pixels show.
+    hand = build_hand(clip.pose, clip.side, seed, cell=float(np.clip(2.7 / size[0], 0.0028, 0.006)))
     model = _scene(clip, hand, size, seed)
     data = mujoco.MjData(model)
     code = np.zeros(model.ngeom + 1, np.uint8)
@@ -152,11 +177,17 @@ def render(clip: Clip, motion: Motion, size: tuple[int, int], seed: int) -> Rend
     try:
         renderer = mujoco.Renderer(model, size[1], size[0])
     except Exception as error:  # MuJoCo raises whatever the GL loader happens to raise
-        raise TaaError("cannot render without a display: no EGL; install libegl1 and libgl1-mesa-dri and set "
-                       f"MUJOCO_GL=egl ({error})") from error
+        raise TaaError(
+            "cannot render without a display: no EGL; install libegl1 and libgl1-mesa-dri and set "
+            f"MUJOCO_GL=egl ({error})"
+        ) from error
     n = len(motion.time)
-    out = Rendered(np.empty((n, size[1], size[0], 3), np.uint8), np.empty((n, size[1], size[0]), np.float16),
-                   np.empty((n, size[1], size[0]), np.uint8), intrinsics(clip.focal, size))
+    out = Rendered(
+        np.empty((n, size[1], size[0], 3), np.uint8),
+        np.empty((n, size[1], size[0]), np.float16),
+        np.empty((n, size[1], size[0]), np.uint8),
+        intrinsics(clip.focal, size),
+    )
     rng = np.random.default_rng(seed + 7)
     mocap = {name: model.body(name).mocapid[0] for name in ("moving", "hand")}
     with renderer:

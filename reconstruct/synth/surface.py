@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import reduce
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Sdf = Callable[[np.ndarray], np.ndarray]
 """(N, 3) points in metres -> (N,) signed distances in metres, negative inside."""
 
 
-def tapered_capsule(x: np.ndarray, a: np.ndarray, b: np.ndarray, ra: float, rb: float) -> np.ndarray:
+def tapered_capsule(x: np.ndarray, a: ArrayLike, b: ArrayLike, ra: float, rb: float) -> np.ndarray:
     """(N,) distance from (N, 3) points to a capsule whose radius runs linearly from ra at a to rb at b."""
     a, b = np.asarray(a, np.float32), np.asarray(b, np.float32)
     ba = b - a
@@ -23,6 +25,11 @@ def smooth_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
     """Union of two distances whose crease is filled over a width k, m."""
     h = np.maximum(k - np.abs(a - b), 0.0) / k
     return np.minimum(a, b) - h * h * k * 0.25
+
+
+def smooth_union(parts: Iterable[np.ndarray], k: float) -> np.ndarray:
+    """Smooth minimum of several distances, from the first to the last."""
+    return reduce(lambda a, b: smooth_min(a, b, k), parts)
 
 
 def gradient(sdf: Sdf, x: np.ndarray, step: float = 3e-4) -> np.ndarray:
@@ -50,7 +57,7 @@ def surface_quads(sdf: Sdf, lower: np.ndarray, upper: np.ndarray, cell: float) -
     far = sdf(np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32))
     far = far.reshape(tuple(len(c) for c in centres))
     value = np.kron(far, np.ones((block, block, block), np.float32))[: shape[0], : shape[1], : shape[2]]
-    near = np.argwhere(np.abs(value) < block * cell + 0.008)
+    near = np.argwhere(np.abs(value) < 0.75 * block * cell + 0.006)
     origin = np.array([a[0] for a in axes], np.float32)
     value[tuple(near.T)] = sdf(origin + np.float32(cell) * near.astype(np.float32))
     inside = value < 0
@@ -60,7 +67,7 @@ def surface_quads(sdf: Sdf, lower: np.ndarray, upper: np.ndarray, cell: float) -
     total = np.zeros((*cells, 3), np.float32)
 
     def view(array: np.ndarray, o: tuple[int, ...]) -> np.ndarray:
-        return array[o[0]:o[0] + cells[0], o[1]:o[1] + cells[1], o[2]:o[2] + cells[2]]
+        return array[o[0] : o[0] + cells[0], o[1] : o[1] + cells[1], o[2] : o[2] + cells[2]]
 
     for axis in range(3):
         for c in corners:
@@ -91,7 +98,7 @@ def surface_quads(sdf: Sdf, lower: np.ndarray, upper: np.ndarray, cell: float) -
             eb, ec = np.eye(3, dtype=int)[b], np.eye(3, dtype=int)[c]
             ring = [number[tuple((at - o).T)] for o in (eb + ec, ec, 0 * eb, eb)]
             quads.append(np.stack(ring if sign > 0 else ring[::-1], axis=1))
-    for _ in range(3):
+    for _ in range(2):
         n = gradient(sdf, vertices)
         vertices = (vertices - np.clip(sdf(vertices), -cell, cell)[:, None] * n).astype(np.float32)
     return vertices, np.concatenate(quads)
@@ -103,7 +110,7 @@ class Noise:
     def __init__(self, seed: int, size: int = 32):
         self._table = np.random.default_rng(seed).uniform(-1.0, 1.0, (size, size, size)).astype(np.float32)
 
-    def __call__(self, x: np.ndarray, wavelength: float | np.ndarray, octaves: int = 1) -> np.ndarray:
+    def __call__(self, x: np.ndarray, wavelength: ArrayLike, octaves: int = 1) -> np.ndarray:
         """(N, 3) points in metres -> (N,) values; wavelength in metres, one a direction if an array."""
         from scipy.ndimage import map_coordinates
 

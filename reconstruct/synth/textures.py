@@ -26,8 +26,9 @@ def paint(colour: tuple[float, float, float], grain: float = 0.012) -> Painter:
     """Nearly even paint: few gradients to track, as on kitchen fronts."""
 
     def draw(h: int, w: int, density: float, rng: np.random.Generator) -> np.ndarray:
-        soft = 0.5 * _smooth(h, w, 0.12 * density, 0.12 * density, rng) + 0.3 * _smooth(h, w, 0.01 * density,
-                                                                                       0.01 * density, rng)
+        soft = 0.5 * _smooth(h, w, 0.12 * density, 0.12 * density, rng) + 0.3 * _smooth(
+            h, w, 0.01 * density, 0.01 * density, rng
+        )
         fine = rng.normal(0, 1, (h, w)).astype(np.float32)
         return _to_bytes(np.array(colour, np.float32) * (1 + grain * (soft + 0.5 * fine))[..., None])
 
@@ -59,7 +60,9 @@ def plaster(colour: tuple[float, float, float]) -> Painter:
     """A wall: faint blotches and specks."""
 
     def draw(h: int, w: int, density: float, rng: np.random.Generator) -> np.ndarray:
-        blotch = _smooth(h, w, 0.15 * density, 0.15 * density, rng) + 0.7 * _smooth(h, w, 0.02 * density, 0.02 * density, rng)
+        blotch = _smooth(h, w, 0.15 * density, 0.15 * density, rng) + 0.7 * _smooth(
+            h, w, 0.02 * density, 0.02 * density, rng
+        )
         return _to_bytes(np.array(colour, np.float32) * (1 + 0.025 * blotch)[..., None])
 
     return draw
@@ -75,7 +78,7 @@ def tiles(colour: tuple[float, float, float], pitch: float = 0.11) -> Painter:
         edge = np.minimum(np.minimum(y % p, p - y % p), np.minimum(x % p, p - x % p)) / density
         glaze = 1 + 0.05 * tone + 0.02 * _smooth(h, w, 0.03 * density, 0.03 * density, rng)
         image = np.array(colour, np.float32) * glaze[..., None]
-        image = np.where((edge < 0.002)[..., None], np.float32([0.55, 0.53, 0.50]), image)
+        image = np.where((edge < 0.002)[..., None], np.array([0.55, 0.53, 0.50], np.float32), image)
         return _to_bytes(image)
 
     return draw
@@ -89,7 +92,7 @@ def checked_cloth(a: tuple[float, float, float], b: tuple[float, float, float], 
         y, x = np.arange(h)[:, None] / p, np.arange(w)[None] / p
         mix = 0.5 * ((y % 2) < 1) + 0.5 * ((x % 2) < 1)
         weave = 1 + 0.05 * rng.normal(0, 1, (h, w)) + 0.05 * _smooth(h, w, 0.05 * density, 0.05 * density, rng)
-        image = np.float32(a) + mix[..., None] * (np.float32(b) - np.float32(a))
+        image = np.array(a, np.float32) + mix[..., None] * (np.array(b, np.float32) - np.array(a, np.float32))
         return _to_bytes(image * weave[..., None])
 
     return draw
@@ -106,7 +109,16 @@ def _sticker(w: int, h: int, rng: np.random.Generator) -> np.ndarray:
     words = ["FRAGILE", "KITCHEN", "No. 37", "TEA", "SPICE", "LOT 2208", "OPEN", "CARE", "MADE 1998", "BOX"]
     size = h / 115
     thick = max(1, round(size * 2))
-    cv2.putText(image, str(rng.choice(words)), (w // 12, round(h * 0.30)), cv2.FONT_HERSHEY_DUPLEX, size, ink, thick, cv2.LINE_AA)
+    cv2.putText(
+        image,
+        str(rng.choice(words)),
+        (w // 12, round(h * 0.30)),
+        cv2.FONT_HERSHEY_DUPLEX,
+        size,
+        ink,
+        thick,
+        cv2.LINE_AA,
+    )
     for k in range(3):
         y = round(h * (0.44 + 0.09 * k))
         text = "".join(rng.choice(list("abcdefghiklmnoprstuw  "), 26))

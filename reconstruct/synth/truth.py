@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from reconstruct.joint.models import joint_transform
-from reconstruct.synth.clips import Clip, Motion
+from reconstruct.synth.animation import Motion
+from reconstruct.synth.clips import Clip
 from reconstruct.synth.hand_model import landmarks
 from reconstruct.synth.objects import Model
 from reconstruct.synth.render import LINK_CODE, Rendered
@@ -74,7 +75,9 @@ class SynthTruth:
         return _project(self.K, self.T_camera_world[frame], xyz_world)[0]
 
     def link_pose(self, q: np.ndarray | float) -> np.ndarray:
-        """(..., 4, 4) moving link at q relative to q = 0."""
+        """(..., 4, 4) moving link at q relative to q = 0; ValueError without a joint."""
+        if self.type is None or self.axis is None:
+            raise ValueError(f"clip {self.name!r} shows no joint")
         return joint_transform(self.type, self.axis, self.point, q)
 
 
@@ -97,7 +100,13 @@ def _sample_tracks(motion: Motion, r: Rendered, seed: int) -> dict[str, np.ndarr
             near = r.depth[t].astype(np.float32)
             flat = np.zeros((h, w), bool)
             inner = near[1:-1, 1:-1]
-            step = np.max([np.abs(inner - near[1 + a:h - 1 + a, 1 + b:w - 1 + b]) for a, b in ((0, 1), (0, -1), (1, 0), (-1, 0))], axis=0)
+            step = np.max(
+                [
+                    np.abs(inner - near[1 + a : h - 1 + a, 1 + b : w - 1 + b])
+                    for a, b in ((0, 1), (0, -1), (1, 0), (-1, 0))
+                ],
+                axis=0,
+            )
             flat[1:-1, 1:-1] = step < 0.02
             v, u = np.nonzero((r.link[t] == LINK_CODE[name]) & flat)
             if not len(v):
@@ -128,7 +137,7 @@ def _sample_tracks(motion: Motion, r: Rendered, seed: int) -> dict[str, np.ndarr
 
 def _image_line(clip: Clip, motion: Motion, K: np.ndarray, centroid: np.ndarray) -> np.ndarray | None:
     model = clip.model
-    if model.kind is None or not clip.touches:
+    if model.axis is None or not clip.touches:
         return None
     if model.kind == "prismatic":
         ends = np.stack([centroid, centroid + 0.1 * model.axis])
@@ -152,8 +161,15 @@ def write_mjcf(model: Model, path: Path) -> None:
     moving = (spec.worldbody if model.kind is None else static).add_body(name="moving")
     for i, box in enumerate(b for b in model.boxes if b.link != "room"):
         body = moving if box.link == "moving" else static
-        body.add_geom(name=f"{box.link}_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre, size=box.size / 2, density=500,
-                      quat=Rotation.from_matrix(box.rotation).as_quat()[[3, 0, 1, 2]], friction=[0.8, 0.005, 0.0001])
+        body.add_geom(
+            name=f"{box.link}_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.centre,
+            size=box.size / 2,
+            density=500,
+            quat=Rotation.from_matrix(box.rotation).as_quat()[[3, 0, 1, 2]],
+            friction=[0.8, 0.005, 0.0001],
+        )
     if model.kind is None:
         moving.add_freejoint(name="free")
     else:
@@ -185,17 +201,39 @@ def write_truth(folder: Path, clip: Clip, motion: Motion, r: Rendered, seed: int
 
     write_mjcf(model, folder / "object.xml")
     facts = {
-        "name": clip.name, "story": clip.story, "seed": seed, "video": "video.mp4", "size": [w, h], "frames": n,
-        "type": model.kind if jointed else None, "axis": listed(model.axis), "point": listed(model.point),
-        "q_end": float(motion.q[-1]) if jointed else None, "q_range": list(model.q_range), "unit": {"revolute": "rad", "prismatic": "m"}.get(model.kind if jointed else None),
-        "K": r.K.tolist(), "T_camera_world": motion.T_camera_world[0].tolist(), "side": clip.side,
-        "diagonal": model.diagonal, "centroid": centroid.tolist(), "image_line": listed(line), "mjcf": "object.xml",
+        "name": clip.name,
+        "story": clip.story,
+        "seed": seed,
+        "video": "video.mp4",
+        "size": [w, h],
+        "frames": n,
+        "type": model.kind if jointed else None,
+        "axis": listed(model.axis),
+        "point": listed(model.point),
+        "q_end": float(motion.q[-1]) if jointed else None,
+        "q_range": list(model.q_range),
+        "unit": {"revolute": "rad", "prismatic": "m"}[str(model.kind)] if jointed else None,
+        "K": r.K.tolist(),
+        "T_camera_world": motion.T_camera_world[0].tolist(),
+        "side": clip.side,
+        "diagonal": model.diagonal,
+        "centroid": centroid.tolist(),
+        "image_line": listed(line),
+        "mjcf": "object.xml",
         "camera": "handheld" if any(clip.drift) else "static",
     }
     s = DEPTH_STRIDE
-    depth = r.depth[:, s // 2::s, s // 2::s].astype(np.float32)
-    arrays = {"time": motion.time, "q": motion.q, "contact": motion.contact, "T_camera_world": motion.T_camera_world,
-              "T_world_moving": motion.T_world_moving, "hand_joints": hand_joints, "link": r.link, "depth": depth.astype(np.float16)}
+    depth = r.depth[:, s // 2 :: s, s // 2 :: s].astype(np.float32)
+    arrays = {
+        "time": motion.time,
+        "q": motion.q,
+        "contact": motion.contact,
+        "T_camera_world": motion.T_camera_world,
+        "T_world_moving": motion.T_world_moving,
+        "hand_joints": hand_joints,
+        "link": r.link,
+        "depth": depth.astype(np.float16),
+    }
     arrays |= {f"tracks_{k}": v for k, v in _sample_tracks(motion, r, seed).items()}
     np.savez_compressed(folder / "truth.npz", **arrays)
     (folder / "truth.json").write_text(json.dumps(facts, indent=1))
@@ -218,13 +256,32 @@ def load_truth(folder: str | Path) -> SynthTruth:
         return None if facts[key] is None else np.array(facts[key])
 
     return SynthTruth(
-        name=facts["name"], video=folder / facts["video"], size=tuple(facts["size"]), type=facts["type"], axis=array("axis"),
-        point=array("point"), q=a["q"], q_range=tuple(facts["q_range"]), time=a["time"], K=np.array(facts["K"]),
-        T_camera_world=a["T_camera_world"], T_world_moving=a["T_world_moving"], hand_joints=a["hand_joints"],
-        side=facts["side"], contact=a["contact"], moving=link == LINK_CODE["moving"], static=link == LINK_CODE["static"],
-        hand=link == LINK_CODE["hand"], room=link == LINK_CODE["room"], depth=np.where(np.isfinite(depth), depth, np.nan),
-        diagonal=facts["diagonal"], image_line=array("image_line"), centroid=np.array(facts["centroid"]),
-        tracks={k[7:]: v for k, v in a.items() if k.startswith("tracks_")}, mjcf=folder / facts["mjcf"])
+        name=facts["name"],
+        video=folder / facts["video"],
+        size=tuple(facts["size"]),
+        type=facts["type"],
+        axis=array("axis"),
+        point=array("point"),
+        q=a["q"],
+        q_range=tuple(facts["q_range"]),
+        time=a["time"],
+        K=np.array(facts["K"]),
+        T_camera_world=a["T_camera_world"],
+        T_world_moving=a["T_world_moving"],
+        hand_joints=a["hand_joints"],
+        side=facts["side"],
+        contact=a["contact"],
+        moving=link == LINK_CODE["moving"],
+        static=link == LINK_CODE["static"],
+        hand=link == LINK_CODE["hand"],
+        room=link == LINK_CODE["room"],
+        depth=np.where(np.isfinite(depth), depth, np.nan),
+        diagonal=facts["diagonal"],
+        image_line=array("image_line"),
+        centroid=np.array(facts["centroid"]),
+        tracks={k[7:]: v for k, v in a.items() if k.startswith("tracks_")},
+        mjcf=folder / facts["mjcf"],
+    )
 
 
 def write_cues(folder: str | Path, scene: str | Path) -> Path:
@@ -247,7 +304,10 @@ def write_cues(folder: str | Path, scene: str | Path) -> Path:
     np.savez_compressed(cues / "camera.npz", K=truth.K, T_world_camera=np.linalg.inv(truth.T_camera_world), metric=True)
     np.savez_compressed(cues / "depth.npz", depth=truth.depth, metric=True)
     np.savez_compressed(cues / "masks.npz", static=truth.static | truth.room, moving=truth.moving, hand=truth.hand)
-    np.savez_compressed(cues / "tracks.npz", uv=truth.tracks["uv"], visible=truth.tracks["visible"],
-                        xyz_world=truth.tracks["xyz_world"])
-    np.savez_compressed(cues / "hand.npz", joints_world=truth.hand_joints, joints_uv=hand_uv, valid=inside, side=truth.side)
+    np.savez_compressed(
+        cues / "tracks.npz", uv=truth.tracks["uv"], visible=truth.tracks["visible"], xyz_world=truth.tracks["xyz_world"]
+    )
+    np.savez_compressed(
+        cues / "hand.npz", joints_world=truth.hand_joints, joints_uv=hand_uv, valid=inside, side=truth.side
+    )
     return cues
