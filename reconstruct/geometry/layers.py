@@ -18,8 +18,8 @@ from reconstruct.geometry.plane import LinkPlane, apply_homography, homography, 
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
-LONG_SIDE = 400
-"""Evidence is gathered on frames of this long side, px."""
+LONG_SIDE = 300
+"""Long side, px, of the window about the link's path in which pixels are looked at."""
 GRID = 180
 """Cells along the longer side of the chart."""
 
@@ -40,6 +40,57 @@ class Chart:
     def to_plane_matrix(self) -> np.ndarray:
         """(3, 3) (column, row, 1) -> plane (u, v, 1)."""
         return np.array([[self.cell, 0, self.origin[0]], [0, self.cell, self.origin[1]], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Window:
+    """The piece of the working frames that the link can reach. low: (2,) first column and row; high: one past the
+    last; size: (width, height) it is shrunk to."""
+
+    low: np.ndarray
+    high: np.ndarray
+    size: tuple[int, int]
+
+    def matrix(self, video: Video) -> np.ndarray:
+        """(3, 3) full px -> window px."""
+        s = np.array(self.size) / (self.high - self.low)
+        shift = s * (0.5 - self.low) - 0.5
+        return np.array([[s[0], 0, shift[0]], [0, s[1], shift[1]], [0, 0, 1.0]]) @ working_matrix(video)
+
+    def crop(self, image: np.ndarray) -> np.ndarray:
+        """Working image (bool or uint8) -> window image."""
+        import cv2
+
+        piece = np.asarray(image[self.low[1]: self.high[1], self.low[0]: self.high[0]])
+        if piece.dtype == bool:
+            return cv2.resize(piece.astype(np.uint8) * 255, self.size, interpolation=cv2.INTER_AREA) > 96
+        return cv2.resize(piece, self.size, interpolation=cv2.INTER_AREA)
+
+    def paste(self, mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+        """Window mask -> (h, w) working mask."""
+        import cv2
+
+        out = np.zeros(shape, bool)
+        span = tuple(int(v) for v in self.high - self.low)
+        piece = cv2.resize(mask.astype(np.uint8) * 255, span, interpolation=cv2.INTER_LINEAR) > 127
+        out[self.low[1]: self.high[1], self.low[0]: self.high[0]] = piece
+        return out
+
+
+def make_window(video: Video, fit: JointFit, plane: LinkPlane, long_side: int = LONG_SIDE) -> Window:
+    """The window about everywhere the link's seed outline goes, with room for what the seed lacks."""
+    seed = plane.to_world(seed_polygon(fit, plane))
+    poses = fit.link_pose(np.linspace(fit.q.min(), fit.q.max(), 15))
+    x = np.einsum("tij,nj->tni", poses[:, :3, :3], seed) + poses[:, None, :3, 3]
+    uv = video.to_work(fit.project(x)).reshape(-1, 2)
+    h, w = video.frames.shape[1:3]
+    uv = uv[np.isfinite(uv).all(1)].clip(0, [w - 1, h - 1])
+    low, high = uv.min(0), uv.max(0)
+    pad = 0.3 * max((high - low).max(), 20)
+    low = np.floor(np.maximum(low - pad, 0)).astype(int)
+    high = np.ceil(np.minimum(high + pad, [w, h])).astype(int)
+    s = min(1.0, long_side / (high - low).max())
+    return Window(low, high, tuple(int(round(v)) for v in s * (high - low)))
 
 
 @dataclass(frozen=True)
@@ -128,16 +179,6 @@ def warp_to_image(chart: Chart, cells: np.ndarray, H: np.ndarray, size: tuple[in
     return cv2.warpPerspective(cells.astype(np.uint8) * 255, M, size, flags=cv2.INTER_LINEAR) > 127
 
 
-def small_frame(video: Video, t: int, scale: float) -> np.ndarray:
-    """(h, w, 3) uint8 BGR working frame shrunk by ``scale``."""
-    import cv2
-
-    image = np.asarray(video.frames[t])
-    if scale < 1:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return image
-
-
 def to_lab(image: np.ndarray) -> np.ndarray:
     """(h, w, 3) float32 slightly blurred Lab in which distances between frames are measured."""
     import cv2
@@ -162,18 +203,16 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
     """
     import cv2
 
-    h, w = video.frames.shape[1:3]
-    scale = min(1.0, LONG_SIDE / max(h, w))
-    S = working_matrix(video, scale)
+    window = make_window(video, fit, plane)
+    size = window.size
+    S = window.matrix(video)
     frames = spread_frames(fit, hands.mask, count)
     seed_outline = seed_polygon(fit, plane)
     chart = make_chart(seed_outline)
     seed = fill(chart, seed_outline)
-    small = [small_frame(video, t, scale) for t in frames]
-    images = np.stack([to_lab(f) for f in small])
-    size = (images.shape[2], images.shape[1])
-    hand = np.stack([cv2.dilate(cv2.resize(hands.mask[t].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST),
-                                np.ones((5, 5), np.uint8)) > 0 for t in frames])
+    images = np.stack([to_lab(window.crop(video.frames[t])) for t in frames])
+    hand = np.stack([cv2.dilate(window.crop(hands.mask[t]).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+                     for t in frames])
     H = S @ homography(fit, plane, fit.q[frames])
     centres = chart.centres()
     uv = np.stack([apply_homography(h_t, centres) for h_t in H])
@@ -185,7 +224,7 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
 
     usable = inside & ~np.stack([sample(m.astype(np.uint8), k) > 0 for k, m in enumerate(hand)])
     warped = np.stack([sample(images[k], k) for k in range(len(frames))])
-    noise = _noise(video, hands, scale, frames)
+    noise = _noise(video, window, frames)
     facing = np.sign(plane.facing[frames])
     link_miss = _link_residual(warped, usable, uv, facing, fit.q[frames])
     occupied = seed
@@ -207,12 +246,12 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
     return Evidence(chart, occupied, score, seen, frames)
 
 
-def _noise(video: Video, hands: Hands, scale: float, frames: np.ndarray) -> float:
+def _noise(video: Video, window: Window, frames: np.ndarray) -> float:
     """Typical difference of one unmoved pixel between two frames, in the units of :func:`to_lab`."""
     if len(frames) < 2:
         return 4.0
     late = [min(int(t) + 1, len(video) - 1) for t in frames[:: max(1, len(frames) // 4)]]
-    pairs = [(to_lab(small_frame(video, t, scale)), to_lab(small_frame(video, t - 1, scale))) for t in late if t]
+    pairs = [(to_lab(window.crop(video.frames[t])), to_lab(window.crop(video.frames[t - 1]))) for t in late if t]
     miss = [np.median(np.linalg.norm(a - b, axis=-1)) for a, b in pairs]
     return float(np.clip(2.5 * np.median(miss), 3.0, 12.0)) if miss else 4.0
 
@@ -285,7 +324,8 @@ def _smooth(score: np.ndarray, seen: np.ndarray, seed: np.ndarray, warped: np.nd
     rows, cols = score.shape
     texture = np.where(usable[..., None], warped, 0).sum(0) / np.maximum(usable.sum(0), 1)[..., None]
     trust = np.clip(seen / 6.0, 0, 1)
-    target = np.clip(score, -1.5, 1.5)
+    # Bare walls and table tops match under either motion: outside the seed such a tie goes to the background.
+    target = np.clip(score - np.where(seed, 0.0, 0.2), -1.5, 1.5)
     # Without votes: the seed is link by construction, the rim of the chart is not.
     pull = trust + 0.02
     target = (trust * target + 0.02 * np.where(seed, 1.0, -0.5)) / pull

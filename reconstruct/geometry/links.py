@@ -10,10 +10,10 @@ from reconstruct.cues import Hands, LinkMasks, Tracks
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
-from reconstruct.geometry.layers import LONG_SIDE, small_frame, spread_frames, to_lab
+from reconstruct.geometry.layers import make_window, spread_frames, to_lab
 from reconstruct.geometry.outline import Shape, build_shape
-from reconstruct.geometry.plane import LinkPlane, fit_plane, working_matrix
-from reconstruct.geometry.solids import carve, extrude, static_box, swept_hulls, to_arrays
+from reconstruct.geometry.plane import LinkPlane, fit_plane
+from reconstruct.geometry.solids import carve, extrude, hull, static_box, swept_hulls, to_arrays
 from reconstruct.geometry.texture import paint, subdivide
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
@@ -58,6 +58,10 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         clouds = clouds + _hand_clouds(np.asarray(hand_points, float), clearance)
     box, about = static_box(shape, plane, fit, end, clearance)
     body = carve(box, clouds)
+    # A block that loses little when cut back by planes alone stays convex: simpler to simulate and to believe.
+    plain = trim_parts((to_arrays(box),), clouds)
+    if plain and hull(plain[0][0]).volume() > 0.85 * body.volume():
+        body = hull(plain[0][0])
     left = body.volume() / max(box.volume(), 1e-30)
     if left < 0.05:
         raise TaaError("no room for the static part beside the moving one's path; check the joint's range")
@@ -76,7 +80,7 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
     inertia = mass_properties(vertices, faces)
     notes.append("the static link's size and sides were not seen: it is a block behind the moving part's closed pose")
     if not decided:
-        notes.append("which end of the motion is closed was not clear from the pixels; the start was taken")
+        notes.append("which end of the motion is closed is not clear from the pixels; the likelier was taken")
     if shape.thickness_origin == "assumed":
         notes.append("the moving link's thickness is assumed")
 
@@ -133,19 +137,14 @@ def closed_end(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mask
     import cv2
 
     ends = [float(fit.q.min()), float(fit.q.max())]
-    scale = min(1.0, LONG_SIDE / max(masks.moving.shape[1:]))
     frames = spread_frames(fit, masks.hand, 12)
-    images = np.stack([to_lab(small_frame(video, t, scale)) for t in frames])
-    size = (images.shape[2], images.shape[1])
+    window = make_window(video, fit, plane)
+    size, S = window.size, window.matrix(video)
+    images = np.stack([to_lab(window.crop(video.frames[t])) for t in frames])
     kernel = np.ones((5, 5), np.uint8)
-
-    def shrink(m: np.ndarray) -> np.ndarray:
-        return cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-
-    link = np.stack([shrink(masks.moving[t]) for t in frames])
-    free = ~np.stack([cv2.dilate((shrink(masks.moving[t]) | shrink(masks.hand[t])).astype(np.uint8), kernel) > 0
+    link = np.stack([window.crop(masks.moving[t]) for t in frames])
+    free = ~np.stack([cv2.dilate(window.crop(masks.moving[t] | masks.hand[t]).astype(np.uint8), kernel) > 0
                       for t in frames])
-    S = working_matrix(video, scale)
     mean = _histogram(images[link])
     path = shape_silhouette(shape, plane, fit, ends, S, size)
     scores = []
@@ -161,11 +160,9 @@ def closed_end(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mask
         pixels = np.concatenate([images[k][here & free[k]] for k in range(len(frames))])
         scores.append(float(np.minimum(_histogram(pixels), mean).sum()) if len(pixels) > 50 else 0.0)
     first = int(np.argmin(np.abs(np.array(ends) - fit.q[0])))
-    other = 1 - first
-    likeness = {"start": scores[first], "other": scores[other]}
-    if scores[other] > 1.3 * scores[first] + 0.05:
-        return ends[other], likeness, True
-    return ends[first], likeness, scores[first] > 1.3 * scores[other] + 0.05
+    likeness = {"start": scores[first], "other": scores[1 - first]}
+    chosen = first if scores[first] >= scores[1 - first] else 1 - first
+    return ends[chosen], likeness, scores[chosen] > 1.3 * scores[1 - chosen] + 0.02
 
 
 def shape_silhouette(shape: Shape, plane: LinkPlane, fit: JointFit, states: list[float], S: np.ndarray,

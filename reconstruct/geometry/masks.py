@@ -6,16 +6,15 @@ import numpy as np
 
 from reconstruct.cues import Hands, LinkMasks, Tracks
 from reconstruct.geometry.layers import (
-    LONG_SIDE,
     Evidence,
     background_residual,
     gather,
-    small_frame,
+    make_window,
     spread_frames,
     to_lab,
     warp_to_image,
 )
-from reconstruct.geometry.plane import LinkPlane, fit_plane, homography, working_matrix
+from reconstruct.geometry.plane import LinkPlane, apply_homography, fit_plane, homography, working_matrix
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -46,9 +45,8 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
     T, h, w = video.frames.shape[:3]
     plane = fit_plane(tracks, fit)
     evidence = gather(video, hands, fit, plane)
-    scale = min(1.0, LONG_SIDE / max(h, w))
     keys = spread_frames(fit, hands.mask, KEY_FRAMES)
-    cut, agreement = _cut_keys(video, hands, fit, plane, evidence, keys, scale)
+    cut, agreement = _cut_keys(video, hands, fit, plane, evidence, keys)
 
     S = working_matrix(video)
     to_full = np.linalg.inv(S)
@@ -57,8 +55,7 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
     confidence = np.zeros(T)
     q_span = max(float(np.ptp(fit.q)), 1e-12)
     side = np.sign(plane.facing)
-    sized = {k: cv2.resize(m.astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_LINEAR) > 127
-             for k, m in zip(keys, cut, strict=True)}
+    sized = dict(zip((int(k) for k in keys), cut, strict=True))
     for t in range(T):
         # A key that shows the other side of the link is a poor model of this frame even if q is near.
         cost = np.abs(fit.q[keys] - fit.q[t]) / q_span + 0.5 * (side[keys] != side[t])
@@ -87,16 +84,15 @@ def _largest_shift(M: np.ndarray, mask: np.ndarray) -> float:
     return float(np.abs(x[:, :2] / x[:, 2:] - box[:, :2]).max())
 
 
-def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evidence: Evidence, keys: np.ndarray,
-              scale: float) -> tuple[list[np.ndarray], np.ndarray]:
-    """GrabCut in the key frames: masks at reduced size and their agreement with the projected outline."""
+def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evidence: Evidence, keys: np.ndarray
+              ) -> tuple[list[np.ndarray], np.ndarray]:
+    """GrabCut in the key frames: masks at working size and their agreement with the projected outline."""
     import cv2
 
-    small = [small_frame(video, t, scale) for t in keys]
-    size = (small[0].shape[1], small[0].shape[0])
-    hand = np.stack([cv2.resize(hands.mask[t].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-                     for t in keys])
-    S = working_matrix(video, scale)
+    window = make_window(video, fit, plane, 400)
+    size, S = window.size, window.matrix(video)
+    small = [window.crop(video.frames[t]) for t in keys]
+    hand = np.stack([window.crop(hands.mask[t]) for t in keys])
     outline = np.stack([warp_to_image(evidence.chart, evidence.occupied, S @ h_t, size)
                         for h_t in homography(fit, plane, fit.q[keys])])
     reach = max(3, int(0.12 * np.sqrt(max(outline.sum((1, 2)).max(), 1))))
@@ -111,7 +107,7 @@ def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evide
     masks, agreement = [], np.zeros(len(keys))
     for n in range(len(keys)):
         seeds = np.zeros(outline[n].shape, np.uint8)
-        uv = video.to_work(fit.project(points[n])) * scale
+        uv = apply_homography(S, fit.project(points[n]))
         for u, v in uv[np.isfinite(uv).all(-1)]:
             cv2.circle(seeds, (int(np.clip(u, -10, 9999)), int(np.clip(v, -10, 9999))), 1, 1, -1)
         mask = _cut(small[n], outline[n], wide[n], hand[n], change[n], noise, seeds > 0, max(2, reach // 2))
@@ -119,7 +115,8 @@ def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evide
         either = ((mask | outline[n]) & ~hand[n]).sum()
         agreement[n] = both / max(either, 1)
         # What the hand hides here may show where this mask is carried to: the outline knows it from other frames.
-        masks.append(mask | (outline[n] & cv2.dilate(hand[n].astype(np.uint8), _disc(2)).astype(bool)))
+        whole = mask | (outline[n] & cv2.dilate(hand[n].astype(np.uint8), _disc(2)).astype(bool))
+        masks.append(window.paste(whole, video.frames.shape[1:3]))
     return masks, agreement
 
 

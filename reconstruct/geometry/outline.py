@@ -9,8 +9,8 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 from shapely.ops import unary_union
 
 from reconstruct.cues import Hands, LinkMasks
-from reconstruct.geometry.layers import Chart, make_chart, seed_polygon, spread_frames
-from reconstruct.geometry.plane import LinkPlane, apply_homography, homography, working_matrix
+from reconstruct.geometry.layers import Chart, make_chart, make_window, seed_polygon, spread_frames
+from reconstruct.geometry.plane import LinkPlane, apply_homography, homography
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -69,22 +69,17 @@ class Shape:
         return np.stack([low, np.r_[b[:, 2:].max(0), max(s.high for s in self.slices)]])
 
 
-def make_views(video: Video, fit: JointFit, masks: LinkMasks, count: int = VIEWS) -> Views:
+def make_views(video: Video, fit: JointFit, plane: LinkPlane, masks: LinkMasks, count: int = VIEWS) -> Views:
     """Shrunk silhouettes of frames spread over q."""
     import cv2
 
     frames = spread_frames(fit, masks.hand, count)
-    h, w = masks.moving.shape[1:]
-    scale = min(1.0, SIZE / max(h, w))
-    size = (round(w * scale), round(h * scale))
-
-    def shrink(m: np.ndarray) -> np.ndarray:
-        return cv2.resize(m.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) > 127
-
-    mask = np.stack([shrink(masks.moving[t]) for t in frames])
-    hand = np.stack([cv2.dilate(shrink(masks.hand[t]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for t in frames])
+    window = make_window(video, fit, plane, SIZE)
+    mask = np.stack([window.crop(masks.moving[t]) for t in frames])
+    hand = np.stack([cv2.dilate(window.crop(masks.hand[t]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+                     for t in frames])
     weight = np.clip(masks.confidence[frames], 0.05, 1.0)
-    return Views(frames, mask & ~hand, ~hand, weight, working_matrix(video, scale), size)
+    return Views(frames, mask & ~hand, ~hand, weight, window.matrix(video), window.size)
 
 
 def vote(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, offset: float = 0.0,
@@ -237,20 +232,26 @@ def hold_points(hands: Hands, fit: JointFit, plane: LinkPlane) -> np.ndarray:
 
 def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, masks: LinkMasks) -> Shape:
     """Outline and thickness of the moving link from its silhouettes."""
-    views = make_views(video, fit, masks)
+    views = make_views(video, fit, plane, masks)
     seed = seed_polygon(fit, plane)
     chart = make_chart(seed)
     share, total = vote(views, fit, plane, chart)
     cells = (share > 0.5) & (total > 0.05 * total.max())
-    outline = trace(chart, cells, 0.012 * plane.extent)
+    outline = trace(chart, cells, 0.018 * plane.extent)
     if outline.is_empty:
         outline = Polygon(seed)
     outline = tidy(outline)
     outline, reach = _reach_hand(outline, hold_points(hands, fit, plane))
     extent = float(np.hypot(*(np.array(outline.bounds[2:]) - outline.bounds[:2])))
     unseen = 0.03 * extent
+    if plane.kind == "across the axis" and fit.type != "prismatic":
+        # A lever seen along its hinge: as deep as it is high, more or less, not a sheet.
+        sides = np.asarray(outline.minimum_rotated_rectangle.exterior.coords)
+        unseen = 0.7 * float(np.linalg.norm(np.diff(sides[:3], axis=0), axis=1).min())
     if fit.metric:
         unseen = max(unseen, 0.008)
+    # Only where the plane is also seen obliquely do silhouettes show the rim.
+    gain = 0.004 if np.abs(plane.facing[views.frames]).min() < 0.6 else 0.02
 
     def draw(low: float, high: float) -> float:
         return agreement(silhouette((Slice(outline, low, high),), views, fit, plane), views)
@@ -263,7 +264,7 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
                 trials[behind, front] = draw(-behind * extent, front * extent) - 0.02 * (behind + front)
     best = max(trials, key=lambda k: trials[k])
     assumed = -unseen, 0.0
-    if trials[best] > draw(*assumed) - 0.02 * 0.03 + 0.004:
+    if trials[best] > draw(*assumed) - 0.02 * unseen / extent + gain:
         low, high, origin = -best[0] * extent, best[1] * extent, "fitted"
         if high - low < 0.5 * unseen:
             low = high - 0.5 * unseen

@@ -99,6 +99,10 @@ class _PlaneJudge:
         inv = np.linalg.inv(self.pose)
         self.rays = np.einsum("tij,mtj->mti", inv[:, :3, :3], rays)
         self.centres = inv[:, :3, :3] @ self.camera + inv[:, :3, 3]
+        self.lever = 1.0
+        if fit.type != "prismatic":
+            arm = np.cross(np.asarray(fit.points) - fit.point, fit.axis)
+            self.lever = max(float(np.median(np.linalg.norm(arm, axis=1))), 1e-12)
         self.unit = max(2.0, 2.0 * float(fit.residual_px or 1.0))
 
     def errors(self, normal: np.ndarray, d: float) -> np.ndarray:
@@ -123,8 +127,14 @@ class _PlaneJudge:
         return out
 
     def cost(self, normal: np.ndarray, d: float) -> float:
-        """Mean error truncated at four units, px: a plane is the one that most points lie on."""
-        return float(np.minimum(self.errors(normal, d), 4 * self.unit).mean())
+        """Mean error truncated at four units, px: the plane that most points lie on, and that a link which
+        reaches its hinge can be drawn on: a parallel to the axis far from it (a door's rim) counts for less."""
+        miss = float(np.minimum(self.errors(normal, d), 4 * self.unit).mean())
+        if self.fit.type == "prismatic":
+            return miss
+        along = abs(float(normal @ self.fit.axis))
+        off = abs(d - float(normal @ self.fit.point)) / self.lever
+        return miss + self.unit * (1 - along) * max(off - 0.1, 0.0) * 3
 
 
 def _candidates(fit: JointFit, points: np.ndarray, rng: np.random.Generator) -> list[tuple[str, np.ndarray, float]]:
