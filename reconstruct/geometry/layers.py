@@ -300,9 +300,11 @@ def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
     for k in range(F):
         diff = images - images[k]
         light, colour = diff[..., 0], np.square(diff[..., 1:]).sum(-1)
-        # Darker here than there by up to a half, hue unchanged: a shadow explains it.
-        shade = (light > 0) & (light < 0.5 * images[..., 0]) & (colour < 16 + 0.02 * np.square(light))
-        d = np.sqrt(np.square(np.where(shade, 0.35, 1.0) * light) + colour)
+        # Darker here than there with the hue kept and the saturation down in step: a shadow explains it.
+        ratio = np.clip(images[k, ..., 0] / np.maximum(images[..., 0], 1.0), 0, 1)[..., None]
+        hue = np.square((images[..., 1:] - 128) * ratio - (images[k, ..., 1:] - 128)).sum(-1)
+        shade = (light > 0) & (light < 0.75 * images[..., 0]) & (hue < 20)
+        d = np.sqrt(np.where(shade, np.square(0.3 * light) + hue, np.square(light) + colour))
         d = np.where(free, d, np.inf)
         d[k] = np.inf
         d.sort(axis=0)
