@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, transport
-from reconstruct.joint.select import SCORE_PX, explained
+from reconstruct.joint.select import SCORE_PX, explained, explained_by
 
 
 def held_out_costs(s: State, obs: Observations, fold: int = 3, scale: float = SCORE_PX) -> np.ndarray:
@@ -60,77 +60,125 @@ def _state_of_frame(s: State, q: np.ndarray, obs: Observations, k: int) -> float
     return value
 
 
-def type_probability(costs: dict[str, np.ndarray], obs: Observations) -> dict[str, float]:
-    """Probability of each type from held-out costs.
+FAR_HINGE = 2.0
+"""A hinge farther from the link than this many link sizes is unusual; the odds fall with the ratio's square."""
 
-    Residuals of one track are strongly correlated in time, and those of neighbours in space: each track counts
-    as one observation with its density weight, not as one per frame, and the noise is the better model's own.
+
+def type_probability(states: dict[str, State], obs: Observations) -> dict[str, float]:
+    """Probability of each type from held-out frames.
+
+    A flexible model explains stray tracks that are not on the link, so types are compared on the tracks that
+    both explain, where these are at least half of what the better one explains. Residuals of one track are
+    strongly correlated in time, and those of neighbours in space: each track counts as one observation with
+    its density weight. A hinge has one more parameter than a slide (Schwarz's criterion), and a hinge many link
+    sizes away is a slide in all but name.
     """
-    names = list(costs)
-    per = {n: costs[n] / np.maximum(obs.seen.sum(1), 1) for n in names}
-    total = {n: float(np.sum(obs.weight * per[n])) for n in names}
-    lead = min(total, key=total.get)
-    noise = max(float(np.sum(obs.weight * per[lead]) / obs.weight.sum()), 0.05)
-    log = np.array([-0.5 * (total[n] - total[lead]) / noise for n in names])
-    p = np.exp(np.clip(log, -50, 0))
-    p /= p.sum()
-    return {n: float(v) for n, v in zip(names, p, strict=True)}
+    names = list(states)
+    if len(names) == 1:
+        return {names[0]: 1.0}
+    costs = {n: held_out_costs(states[n], obs) for n in names}
+    links = {n: explained(states[n], obs)[1] > 0.5 for n in names}
+    common = np.logical_and.reduce([links[n] for n in names])
+    if common.sum() < 0.5 * max(links[n].sum() for n in names):
+        common = np.logical_or.reduce([links[n] for n in names])
+    log = {}
+    effective = max(float(obs.weight[common].sum()), 2.0)
+    for n in names:
+        mean = float((obs.weight[common] * costs[n][common]).sum() / (obs.weight[common] @ obs.seen[common].sum(1) + 1e-9))
+        parameters = 3 if n == "revolute" else 2
+        log[n] = -effective * np.log(max(mean, 0.05)) - 0.5 * parameters * np.log(effective)
+        if n == "revolute":
+            log[n] -= 2 * np.log(max(hinge_distance(states[n], obs, common) / FAR_HINGE, 1.0))
+    top = max(log.values())
+    p = {n: float(np.exp(max(v - top, -50.0))) for n, v in log.items()}
+    return {n: v / sum(p.values()) for n, v in p.items()}
+
+
+def hinge_distance(s: State, obs: Observations, link: np.ndarray) -> float:
+    """Distance of the hinge from the link's middle, over the link's size."""
+    X, _ = transport(s, obs)
+    base = int(np.argmax(obs.seen[link].sum(0)))
+    P = X[link & obs.seen[:, base], base]
+    if len(P) < 4:
+        return 0.0
+    size = np.linalg.norm(np.quantile(P, 0.9, axis=0) - np.quantile(P, 0.1, axis=0))
+    return float(np.median(np.linalg.norm(np.cross(P - s.point, s.axis), axis=1)) / max(size, 1e-9))
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Median residuals, working px: of the joint, and of the same points moving freely in every frame."""
+    """The joint against the same body moving freely.
+
+    Attributes:
+        joint_px, free_px: median residuals of the link's tracks, working px.
+        joint_gain, free_gain: explained motion (as in ``explained``) of all tracks by either.
+    """
 
     joint_px: float
     free_px: float
+    joint_gain: float
+    free_gain: float
 
 
-def free_motion(s: State, obs: Observations, link: np.ndarray, rounds: int = 8) -> FreeMotion | None:
-    """How much better a free rigid body explains the link's tracks than the joint does.
+def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | None:
+    """How much better a free rigid body explains the tracks than the joint does.
 
-    Alternates pose from points (robust PnP) and points from poses (linear triangulation along every frame).
+    Starts from the joint's own motion and alternates pose from points (PnP on the current consensus) and
+    points from poses (linear triangulation over all frames); the consensus may grow.
 
     Returns:
         None if too few tracks overlap to tell.
     """
     import cv2
 
-    sub = np.flatnonzero(link)
+    K = obs.seen.shape[1]
     X, _ = transport(s, obs)
-    if len(sub) < 8:
+    joint_gain, per = explained(s, obs)
+    link = per > 0.5
+    if link.sum() < 8:
         return None
-    seen, xy = obs.seen[sub], obs.xy[sub]
-    K = seen.shape[1]
-    # Points in the link frame of the key frame that most tracks see.
-    base = int(np.argmax(seen.sum(0)))
-    dq = replace(s, depth=s.depth[sub])
-    part = replace(obs, xy=xy, seen=seen, ref=obs.ref[sub], weight=obs.weight[sub])
-    P = transport(dq, part)[0][:, base]
-    joint = np.linalg.norm(reprojection(X, obs)[sub], axis=-1)
-    poses: list[tuple[np.ndarray, np.ndarray] | None] = [None] * K
+    base = int(np.argmax(obs.seen[link].sum(0)))
+    P = X[:, base].copy()
+    poses: list[tuple[np.ndarray, np.ndarray] | None] = [_relative_pose(s, base, k) for k in range(K)]
+    members = link
     for _ in range(rounds):
         for k in range(K):
-            use = seen[:, k]
+            use = obs.seen[:, k] & members
             if use.sum() < 8:
                 poses[k] = None
                 continue
             r0, t0 = poses[k] if poses[k] is not None else _relative_pose(s, base, k)
-            ok, rv, tv = cv2.solvePnP(P[use], xy[use, k], np.eye(3), None, r0.copy(), t0.copy(), True, cv2.SOLVEPNP_ITERATIVE)
+            ok, rv, tv = cv2.solvePnP(P[use], obs.xy[use, k], np.eye(3), None, r0.copy(), t0.copy(), True, cv2.SOLVEPNP_ITERATIVE)
             poses[k] = (rv, tv) if ok else None
-        P = _triangulate(xy, seen, poses, P)
-    free = np.full(joint.shape, np.nan)
-    for k in range(K):
-        if poses[k] is None:
-            continue
-        proj, _ = cv2.projectPoints(P, *poses[k], np.eye(3), None)
-        free[:, k] = np.linalg.norm(proj[:, 0] - xy[:, k], axis=-1) / obs.px
-    both = seen & np.isfinite(free)
+        P = _triangulate(obs.xy, obs.seen, poses, P)
+        free = _free_residuals(P, poses, obs)
+        gain = explained_by(free**2, obs, np.isfinite(free))
+        members = gain > 0.5
+        if members.sum() < 8:
+            return None
+    both = obs.seen & np.isfinite(free) & link[:, None] & members[:, None]
     # Frames near the base state say nothing: everything fits there.
-    away = np.abs(s.q - s.q[base]) > 0.15 * np.ptp(s.q)
-    both &= away[None]
+    both &= (np.abs(s.q - s.q[base]) > 0.15 * np.ptp(s.q))[None]
     if both.sum() < 30:
         return None
-    return FreeMotion(float(np.median(joint[both])), float(np.median(free[both])))
+    joint2 = np.sum(reprojection(X, obs) ** 2, axis=-1)
+    valid = np.isfinite(free)
+    score = lambda g: float(np.sum(obs.weight * np.clip(g, 0, None) * np.sqrt((obs.seen & valid).sum(1))))  # noqa: E731
+    return FreeMotion(
+        float(np.median(np.sqrt(joint2[both]))), float(np.median(free[both])),
+        score(explained_by(joint2, obs, valid)), score(explained_by(free**2, obs, valid)),
+    )
+
+
+def _free_residuals(P: np.ndarray, poses: list, obs: Observations) -> np.ndarray:
+    import cv2
+
+    free = np.full(obs.seen.shape, np.nan)
+    for k, pose in enumerate(poses):
+        if pose is not None:
+            proj, _ = cv2.projectPoints(P, *pose, np.eye(3), None)
+            free[:, k] = np.linalg.norm(proj[:, 0] - obs.xy[:, k], axis=-1) / obs.px
+    return free
 
 
 def _relative_pose(s: State, base: int, k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -160,5 +208,3 @@ def _triangulate(xy: np.ndarray, seen: np.ndarray, poses: list, P: np.ndarray) -
     damp = 1e-3 * np.trace(A, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     return np.linalg.solve(A + damp + 1e-9 * np.eye(3), (b + (damp @ P[..., None])[..., 0])[..., None])[..., 0]
 
-
-__all__ = ["FreeMotion", "explained", "free_motion", "held_out_costs", "type_probability"]

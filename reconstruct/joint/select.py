@@ -232,15 +232,20 @@ def explained(s: State, obs: Observations, scale: float = SCORE_PX) -> tuple[flo
         (sum over tracks, (N,) mean contribution of each track in [−1, 1]).
     """
     X, _ = transport(s, obs)
-    r2 = np.sum(reprojection(X, obs) ** 2, axis=-1)
-    own = obs.xy[np.arange(len(obs.ref)), obs.ref][:, None]
-    moved2 = np.where(obs.seen, np.sum(((obs.xy - own) / obs.px) ** 2, axis=-1), 0)
-    rho = lambda e2: 1 - 1 / (1 + e2 / scale**2)  # noqa: E731
-    gain = np.where(obs.seen, rho(moved2) - rho(r2), 0)
-    per = gain.sum(1) / np.maximum(obs.seen.sum(1) - 1, 1)
+    per = explained_by(np.sum(reprojection(X, obs) ** 2, axis=-1), obs, obs.seen, scale)
     sane = (s.depth > 0.1 * np.median(s.depth)) & (s.depth < 10 * np.median(s.depth))
     per = np.where(sane, per, 0)
     return float(np.sum(obs.weight * np.clip(per, 0, None) * np.sqrt(obs.seen.sum(1)))), per
+
+
+def explained_by(r2: np.ndarray, obs: Observations, valid: np.ndarray, scale: float = SCORE_PX) -> np.ndarray:
+    """(N,) mean contribution of each track for squared residuals r2 (N, K), px^2, counted where valid."""
+    own = obs.xy[np.arange(len(obs.ref)), obs.ref][:, None]
+    moved2 = np.sum(((obs.xy - own) / obs.px) ** 2, axis=-1)
+    rho = lambda e2: 1 - 1 / (1 + e2 / scale**2)  # noqa: E731
+    counted = obs.seen & valid
+    gain = np.where(counted, rho(moved2) - rho(np.where(counted, r2, 0)), 0)
+    return gain.sum(1) / np.maximum(counted.sum(1) - 1, 1)
 
 
 def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: int = 10,
