@@ -23,7 +23,7 @@ from reconstruct.hand.skeleton import HAND_SIZE_STD, TIPS, one_anatomy
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
-CARRY_SECONDS = 0.5  # a hand lost for longer than this before the part moves was not holding it
+FOUND_SECONDS = 0.15  # a hand that holds on so soon after it is found was holding on before
 REST_STD = 0.015  # m, how still a driving hand's tips are in the link's frame
 
 
@@ -124,9 +124,9 @@ def rest_pose(link: np.ndarray, motion: np.ndarray) -> np.ndarray:
 def _carried(drive: Drive, valid: np.ndarray, moving: np.ndarray, rate: float) -> np.ndarray:
     """Frames in which the hand is not seen but must still be holding on: out of the picture while the part moves."""
     out = np.zeros(len(valid), bool)
-    reach = max(1, round(CARRY_SECONDS * rate))
+    reach = max(1, round(FOUND_SECONDS * rate))
     for a, b in runs(~valid):
-        # Lost at the part is holding it; found at the part was holding it only if it goes on to move it.
+        # Lost at the part is holding it; found at the part was holding it only if it is holding it then.
         before = a > 0 and drive.attached[:a].any() and drive.near[max(0, a - 3) : a].any()
         after = b < len(valid) and drive.attached[b : b + reach].any() and drive.near[b : b + 3].any()
         if before and moving[a:b].any():
@@ -147,7 +147,7 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         hands: hands of the same frames.
         fit: metric joint.
         geometry: both links; the moving one's collision parts are what the hand meets.
-        masks: not used yet.
+        masks: of the links; accepted for symmetry with the other stages, the geometry carries what is needed.
         check: replay the candidate grips against the passive joint and keep the first that drives it.
 
     Returns:
@@ -251,7 +251,7 @@ def _assemble(fit: JointFit, shape: LinkShape, world: np.ndarray, pose: np.ndarr
     if not free.any() or not stretches:
         return out
     away = exit_direction(shape, grip.pose, _to_link(pose, world)[free].mean((0, 1)) - grip.pose.mean(0))
-    return clear_path(shape, pose, out, attached, away, rate)
+    return clear_path(shape, pose, out, held, attached, away, rate)
 
 
 def _absent(video: Video, fit: JointFit, shape: LinkShape, note: str) -> HandReference:

@@ -44,7 +44,10 @@ def moving_frames(fit: JointFit, time: np.ndarray) -> np.ndarray:
     t = np.arange(len(fit.q))
     low, high = np.clip(t - half, 0, len(t) - 1), np.clip(t + half, 0, len(t) - 1)
     speed = np.abs(fit.q[high] - fit.q[low]) / np.maximum(time[high] - time[low], 1e-6)
-    return speed > max(0.03 * float(np.ptp(fit.q)), 1e-9)
+    out = close_gaps(speed > max(0.03 * float(np.ptp(fit.q)), 1e-9), half)
+    for a, b in runs(out):  # a flicker of one or two frames is noise of q
+        out[a:b] = b - a > half
+    return out
 
 
 def close_gaps(flags: np.ndarray, length: int) -> np.ndarray:
@@ -88,17 +91,20 @@ def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndar
     for t in np.flatnonzero((away < BESIDE) & moving):
         size = float(palm_pixels(hand.uv[t]))
         gap = np.linalg.norm(hand.uv[t, CONTACT][:, None] - picture[t][None], axis=-1)
-        # The part's motion at its surface points nearest to the hand.
-        beside = np.unique(np.argsort(gap, axis=1)[:, : min(3, gap.shape[1])])
+        # Each finger joint against the surface beside it: a hand that turns with a lid moves differently everywhere.
+        beside = np.argsort(gap, axis=1)[:, : min(3, gap.shape[1])]
+        close = gap.min(1) < BESIDE * size
         for half in spans:
             a, b = max(0, t - half), min(n - 1, t + half)
             a, b = a + int(np.argmax(hand.valid[a : t + 1])), b - int(np.argmax(hand.valid[t : b + 1][::-1]))
-            part = np.median(picture[b][beside] - picture[a][beside], axis=0)
-            if np.linalg.norm(part) < 0.25 * size:  # too little to tell a moving hand from a resting one: look longer
+            part = np.median(picture[b][beside] - picture[a][beside], axis=1)
+            stride = np.linalg.norm(part, axis=1)
+            tell = close & (stride > 0.25 * size)
+            if tell.sum() < 3:  # too little motion to tell a moving hand from a resting one: look longer
                 continue
-            own = np.median(hand.uv[b, CONTACT] - hand.uv[a, CONTACT], axis=0)
-            agree[t] = np.linalg.norm(own - part) < AGREE * np.linalg.norm(part)
-            differ[t] = not agree[t]
+            own = hand.uv[b, CONTACT] - hand.uv[a, CONTACT]
+            share = np.mean(np.linalg.norm(own - part, axis=1)[tell] < AGREE * stride[tell])
+            agree[t], differ[t] = share >= 0.3, share < 0.15
             break
     return away, agree, differ
 
@@ -120,6 +126,21 @@ def _majority(flags: np.ndarray, among: np.ndarray, half: int) -> np.ndarray:
     votes = np.convolve((flags & among).astype(float), np.ones(2 * half + 1), "same")
     total = np.convolve(among.astype(float), np.ones(2 * half + 1), "same")
     return among & (votes > 0.5 * np.maximum(total, 1))
+
+
+def _rest(attached: np.ndarray, moving: np.ndarray, near: np.ndarray, hand: HandTrack) -> np.ndarray:
+    """Over the neighbouring frames in which part and hand both stay where they are."""
+    out = attached.copy()
+    for a, b in runs(attached):
+        for edge, step in ((a, -1), (b - 1, 1)):
+            t = edge + step
+            while 0 <= t < len(out) and not moving[t] and near[t] and hand.valid[edge]:
+                shift = np.median(hand.uv[t, CONTACT] - hand.uv[edge, CONTACT], axis=0)
+                if np.linalg.norm(shift) > 0.25 * palm_pixels(hand.uv[edge]):
+                    break
+                out[t] = True
+                t += step
+    return out
 
 
 def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarray | None = None) -> Drive:
@@ -161,4 +182,5 @@ def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarra
         seen = valid[a:b]
         if not (seen & ~near[a:b]).any() and (near[a:b].sum() >= 0.8 * seen.sum()):
             attached[a:b] = True
+    attached = _rest(attached, moving, near, hands.tracks[index])
     return Drive(index, near, drives, attached)

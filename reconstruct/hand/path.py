@@ -8,6 +8,7 @@ from reconstruct.hand.grip import penetration
 from reconstruct.hand.shape import LinkShape
 
 STANDOFF = 0.04  # m between the grip and where the hand waits
+SLIDE, BLEND = 0.2, 0.4  # s: along the exit direction into or out of the grip; from there to what was seen
 CLEAR = 0.004  # m
 STEPS = np.arange(0.0, 0.41, 0.01)
 
@@ -33,34 +34,33 @@ def exit_direction(shape: LinkShape, grip: np.ndarray, towards: np.ndarray) -> n
     return chosen
 
 
-def clear_path(shape: LinkShape, pose: np.ndarray, world: np.ndarray, attached: np.ndarray, away: np.ndarray,
-               rate: float) -> np.ndarray:
-    """Move the hand along ``away`` in the frames in which it is not attached, so far that it is clear of the link.
+def clear_path(shape: LinkShape, pose: np.ndarray, world: np.ndarray, held: np.ndarray, attached: np.ndarray,
+               away: np.ndarray, rate: float) -> np.ndarray:
+    """Approach and retreat along ``away`` next to the grip; elsewhere as seen, moved along ``away`` until clear.
 
     Args:
-        pose: (T, 4, 4) of the link.  world: (T, 21, 3).  attached: (T,).  away: (3,) link frame.
+        pose: (T, 4, 4) of the link.
+        world: (T, 21, 3) m, the hand as seen.  held: (T, 21, 3) m, the grip carried with the link.
+        attached: (T,) frames in which the hand is in its grip.
+        away: (3,) unit exit direction, link frame.
     """
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
     n = len(world)
-    direction = pose[:, :3, :3] @ away
+    direction = (pose[:, :3, :3] @ away)[:, None]
     frames = np.flatnonzero(attached)
-    t = np.arange(n)
-    since = np.abs(t[:, None] - frames[None]).min(1) / rate
-    # At the grip's edge 0, at a fifth of a second STANDOFF.
-    lift = np.where(attached, 0.0, STANDOFF * np.clip(since / 0.2, 0, 1))
+    since = np.abs(np.arange(n)[:, None] - frames[None]).min(1) / rate
+    out_of_grip = np.clip(since / SLIDE, 0.0, 1.0)
+    seen = np.clip((since - SLIDE) / BLEND, 0.0, 1.0)
+    seen = (seen**2 * (3 - 2 * seen))[:, None, None]
+    path = held + (STANDOFF * out_of_grip)[:, None, None] * direction
+    path = (1 - seen) * path + seen * world
     need = np.zeros(n)
-    for k in np.flatnonzero(~attached):
-        link = (world[k] - pose[k, :3, 3]) @ pose[k, :3, :3]
-        for h in STEPS:
-            if penetration(shape, link + max(h, 0) * away).max() <= 0 and (
-                    penetration(shape, link + (h + CLEAR) * away).max() <= 0):
-                need[k] = h
-                break
-        else:
-            need[k] = STEPS[-1]
-    # The last frames before contact slide along the exit direction into the grip.
-    window = max(1, round(0.2 * rate))
+    for k in np.flatnonzero(since > SLIDE):
+        link = (path[k] - pose[k, :3, 3]) @ pose[k, :3, :3]
+        blocked = [penetration(shape, link + (h + CLEAR) * away).max() > 0 for h in STEPS]
+        # The last blocked place along the way decides: what lies before it may be the link's other side.
+        need[k] = STEPS[min(int(np.flatnonzero(blocked)[-1]) + 1, len(STEPS) - 1)] if any(blocked) else 0.0
+    window = max(1, round(SLIDE * rate))
     need = gaussian_filter1d(maximum_filter1d(need, 2 * window + 1), 0.4 * window, mode="nearest")
-    lift = np.maximum(lift, np.where(attached, 0.0, need * np.clip(since / 0.2, 0, 1)))
-    return world + lift[:, None, None] * direction[:, None]
+    return path + (need * out_of_grip)[:, None, None] * direction
