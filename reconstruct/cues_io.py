@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -172,30 +172,32 @@ def mask_at_work_size(mask: np.ndarray, video: Video, name: str) -> np.ndarray:
     return np.stack([cv2.resize(m.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0 for m in mask])
 
 
-def meshes_from_cue(folder: Path) -> dict[str, LinkMesh]:
-    """The user's ``meshes/static.glb`` and ``meshes/moving.glb``, without collision parts yet.
+def meshes_from_cue(folder: Path, names: Iterable[str] = MESHES) -> dict[str, LinkMesh]:
+    """Those of ``meshes/static.glb`` and ``meshes/moving.glb`` that are there, with collision parts.
 
     Raises:
         TaaError: a file is not a mesh.
     """
     import trimesh
 
+    from reconstruct.geometry.collision import convex_parts
+
     links = {}
-    for name in MESHES:
+    for name in names:
         file = folder / name
         try:
             mesh: Any = trimesh.load(file, force="mesh", process=False)
-            colours = np.asarray(mesh.visual.to_color().vertex_colors, np.uint8)
+            visual = mesh.visual
+            colours = np.asarray((visual.to_color() if visual.kind == "texture" else visual).vertex_colors, np.uint8)
         except Exception as error:  # trimesh raises whatever its readers raise
             raise TaaError(f"cannot read the mesh {file} ({str(error)[:80]}); export it as binary glTF") from error
         if len(mesh.faces) == 0:
             raise TaaError(f"{file} holds no faces; export a surface")
         if colours.shape != (len(mesh.vertices), 4):
             colours = np.tile(np.uint8([160, 160, 160, 255]), (len(mesh.vertices), 1))
-        assumed = np.zeros(len(mesh.faces), bool)
-        links[Path(name).stem] = LinkMesh(
-            np.asarray(mesh.vertices, float), np.asarray(mesh.faces), colours, assumed, ()
-        )
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+        parts, _ = convex_parts(vertices, faces)
+        links[Path(name).stem] = LinkMesh(vertices, faces, colours, np.zeros(len(faces), bool), tuple(parts))
     return links
 
 

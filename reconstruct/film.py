@@ -178,11 +178,11 @@ def replay_frames(
     pictures = rendered(asset, (run.qpos[k] for k in chosen), hand, camera, size)
     for k, right in zip(chosen, pictures, strict=True):
         touch = "hand drives" if run.contact[k] else "no contact"
-        right = label(right, f"replay {factor * run.q[k]:.0f} {unit}, {touch}")
+        right = label(right, f"replay {round(factor * run.q[k])} {unit}, {touch}")
         if source is not None:
             left = next(source, left)
         if left is not None:
-            shown = label(fit_height(left, right.shape[0]), f"video {factor * run.q_demo[k]:.0f} {unit}")
+            shown = label(fit_height(left, right.shape[0]), f"video {round(factor * run.q_demo[k])} {unit}")
             right = np.hstack([shown, np.full((right.shape[0], 4, 3), 20, np.uint8), right])
         yield right
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -302,7 +302,21 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
         return cues_io.masks_from_cue(folder.read("masks", "static", "moving", "hand"), video)
 
     masks = stages.run("masks", segment, ("geometry",), given=given.get("masks"))
-    geometry: Geometry = stages.run("geometry", lambda: build_geometry(video, hands, tracks, fit, masks), ("geometry",))
+    meshes = {name: given[name] for name in cues_io.MESHES if name in given}
+
+    def shape() -> Geometry:
+        links = cues_io.meshes_from_cue(folder.folder, meshes) if folder and meshes else {}
+        if len(links) == len(cues_io.MESHES):
+            built = Geometry(links["static"], links["moving"])
+        else:
+            built = replace(build_geometry(video, hands, tracks, fit, masks), **links)
+        if links:
+            origin = {f"{name}_mesh": {"value": "cues/meshes", "origin": "given"} for name in links}
+            words = f"your mesh of the {' and the '.join(links)} link is taken as it is"
+            built = replace(built, provenance={**built.provenance, **origin}, notes=(*built.notes, words))
+        return built
+
+    geometry: Geometry = stages.run("geometry", shape, ("geometry",), options={"meshes": meshes})
     reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
     if folder:
         folder.write("masks", cues_io.mask_arrays(masks))

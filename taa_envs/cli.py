@@ -219,7 +219,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     data: dict | None = None
     code = 0
-    with _stdout_kept_clean(command.json) as stdout:
+    # A process that ends after this command keeps its stdout redirected: libraries may print while they unload.
+    with _stdout_kept_clean(command.json, restore=argv is not None) as stdout:
         try:
             outcome = command.run()
             if command.json:
@@ -237,33 +238,38 @@ def main(argv: Sequence[str] | None = None) -> int:
             sentence = error_sentence(error)
             print(f"error: {sentence}", file=sys.stderr)
             data, code = {"error": sentence}, 1
-        if command.json:
-            print(json.dumps(data, allow_nan=False), file=stdout, flush=True)
+        try:
+            if command.json:
+                print(json.dumps(data, allow_nan=False), file=stdout)
+            stdout.flush()
+        except OSError as error:  # a closed pipe, a full disk
+            print(f"error: cannot write to stdout ({error.strerror}); look at where it goes", file=sys.stderr)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stdout.fileno())  # nothing more will fail while closing
+            code = 1
     return code
 
 
 @contextlib.contextmanager
-def _stdout_kept_clean(wanted: bool) -> Iterator[IO[str]]:
+def _stdout_kept_clean(wanted: bool, restore: bool) -> Iterator[IO[str]]:
     """With --json, send whatever libraries print (native ones too) to stderr; yields the real stdout."""
     if not wanted:
         yield sys.stdout
         return
-    sys.stdout.flush()
+    real = sys.stdout
+    real.flush()
+    kept = os.dup(1)
+    # Python's own prints go by sys.stdout, native ones by descriptor 1.
+    if real is sys.__stdout__:
+        real = os.fdopen(os.dup(kept), "w", encoding="utf-8")
+    os.dup2(2, 1)
     try:
-        target = sys.stdout.fileno()
-    except (OSError, AttributeError):  # a stdout without a file, as tests have
-        real = sys.stdout
         with contextlib.redirect_stdout(sys.stderr):
             yield real
-        return
-    kept = os.dup(target)
-    os.dup2(sys.stderr.fileno(), target)
-    try:
-        with os.fdopen(kept, "w", encoding="utf-8") as real:
-            yield real
     finally:
-        sys.stdout.flush()
-        # Late words of libraries at exit go to stderr too: the descriptor stays redirected.
+        real.flush()
+        if restore:
+            os.dup2(kept, 1)
+        os.close(kept)
 
 
 def error_sentence(error: BaseException) -> str:

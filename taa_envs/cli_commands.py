@@ -325,9 +325,10 @@ def _short(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return "0" if abs(value) < 1e-9 else f"{value:.4g}"
     if isinstance(value, (list, tuple)):
-        return "(" + ", ".join(_short(v) for v in value) + ")" if len(value) <= 4 else f"[{len(value)} numbers]"
+        count = np.asarray(value, dtype=object).size
+        return "(" + ", ".join(_short(v) for v in value) + ")" if count <= 4 else f"{count} numbers"
     return str(value)
 
 

@@ -26,7 +26,7 @@ PROVIDERS: dict[str, tuple[Provider, ...]] = {
                  "Apache-2.0"),
     ),
     "track": (Provider("lucas-kanade", ("cv2",), "corners from many reference frames, both directions", "Apache-2.0"),),
-    "segment": (Provider("grabcut", ("cv2",), "link masks from tracks and the background seen elsewhere", "Apache-2.0"),),
+    "segment": (Provider("grabcut", ("cv2",), "link masks from tracks and the uncovered background", "Apache-2.0"),),
     "depth": (Provider("none", (), "no depth network is embedded; the joint is fitted without depth", "-"),),
     "mesh": (Provider("outline", ("trimesh", "coacd", "manifold3d"), "planar patches and outlines", "Apache-2.0"),),
 }  # fmt: skip

@@ -155,7 +155,7 @@ def _replay_rows(result: ReplayResult) -> list[dict]:
         share("joint progress", result.joint_progress), share("largest progress on the way", result.max_progress),
         share("contact fraction", result.contact_fraction), share("final q error", result.final_q_error),
         share("wrong way", result.wrong_way),
-        {"name": "largest overlap of hand and part", "value": f"{1e3 * result.max_penetration_m:.1f} mm", "share": None},
+        {"name": "deepest overlap with the part", "value": f"{1e3 * result.max_penetration_m:.1f} mm", "share": None},
         *(share(names.get(name, name), value) for name, value in result.controls.items()),
     ]  # fmt: skip
 
@@ -167,7 +167,7 @@ def short(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, (int, float)):
-        return f"{value:.4g}"
+        return "0" if abs(value) < 1e-9 else f"{value:.4g}"
     if isinstance(value, (list, tuple)):
         flat = np.asarray(value, dtype=object).reshape(-1)
         return "(" + ", ".join(short(v) for v in value) + ")" if len(flat) <= 4 else f"{len(flat)} numbers"

@@ -29,8 +29,8 @@ def state_words(fit: JointFit, t: int) -> str:
     if fit.q is None or fit.type is None:
         return ""
     if fit.type == "prismatic":
-        return f"{1000 * fit.q[t]:.0f} mm" if fit.metric else f"{fit.q[t]:.3f} units"
-    return f"{np.degrees(fit.q[t]):.0f} deg"
+        return f"{round(1000 * float(fit.q[t]))} mm" if fit.metric else f"{fit.q[t]:.3f} units"
+    return f"{round(float(np.degrees(fit.q[t])))} deg"
 
 
 def overlay(video: Video, t: int, height: int, hands: Hands | None = None, tracks: Tracks | None = None,
