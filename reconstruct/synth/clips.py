@@ -237,8 +237,8 @@ def _lift(seed: int) -> Clip:
     model = objects.parcel(seed)
     pose = HandPose(
         flex=((46, 30, 14), (48, 30, 14), (48, 30, 14), (46, 30, 14)),
-        spread=(10, 1, -8, -18),
-        thumb=(58, 50, -6, 8),
+        spread=(14, 2, -9, -22),
+        thumb=(62, 40, 0, 8),
         wrist=(6, 0),
     )
     y = np.array([0.0, 1, 0])
@@ -247,7 +247,7 @@ def _lift(seed: int) -> Clip:
         "right",
         np.array([0, -0.12, -1.0]),
         np.array([0, 1, -0.12]),
-        np.array([0.0, 0.05, 0.072]),
+        np.array([0.0, 0.05, 0.134]),
         (8, 12, 16, 20),
         (np.array([0, 0.05, 0.0]), y),
         (7, 8, 11, 12, 15, 16, 19, 20),
@@ -261,7 +261,7 @@ def _lift(seed: int) -> Clip:
         T,
         np.array([0.05, -0.14, 0.16]),
         np.array([0.0, 0.0, 0.09]),
-        np.array([-0.24, -0.62, 0.56]),
+        np.array([-0.26, -0.50, 0.72]),
         np.array([0.03, 0.0, 0.14]),
         free_path=_lifted,
     )

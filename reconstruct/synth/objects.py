@@ -260,7 +260,7 @@ def oven(seed: int) -> Model:
 def parcel(seed: int) -> Model:
     """A parcel that stands on a table, not attached to anything."""
     carton = tx.with_stickers(tx.paint((0.66, 0.50, 0.33), 0.05), 3, 0.055)
-    boxes = room(seed, 0.40) + [_box("moving", (-0.055, -0.05, 0.0), (0.065, 0.05, 0.10), carton, density=1500)]
+    boxes = room(seed, 0.40) + [_box("moving", (-0.055, -0.07, 0.0), (0.085, 0.05, 0.16), carton, density=1500)]
     boxes.append(
         _box("static", (-0.22, 0.12, 0.0), (0.24, 0.26, 0.11), tx.with_stickers(tx.wood((0.5, 0.36, 0.25)), 4, 0.06))
     )
