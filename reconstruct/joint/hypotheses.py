@@ -105,19 +105,23 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
             axis=-2,
         )
         B = np.cross(x[None, :, 1:, None, :], C)
-        AA = np.einsum("dnmi,dnmi->dn", A, A) + 1e-12
-        AB = np.einsum("dnmi,dnmki->dnk", A, B)
-        BB = np.einsum("dnmki,dnmli->dnkl", B, B)
+        flat = A.reshape(*A.shape[:2], -1)
+        sides = np.moveaxis(B, -2, -1).reshape(*flat.shape, 2)               # (d, n, (m-1) 3, 2)
+        AA = np.sum(flat**2, axis=-1) + 1e-12
+        AB = (flat[:, :, None] @ sides)[:, :, 0]
+        BB = sides.swapaxes(-1, -2) @ sides
         M = BB - AB[..., :, None] * AB[..., None, :] / AA[..., None, None]
         scale = np.trace(BB, axis1=-1, axis2=-2)[..., None, None] + 1e-12
         c = _smallest_eigenvector_2x2((M / scale)[:, picks].sum(axis=2))  # (d, subsets, 2)
-        lam = -np.einsum("dnk,dsk->dsn", AB, c) / AA[:, None]
+        lam = -(c @ AB.swapaxes(-1, -2)) / AA[:, None]
         sign = np.where(np.median(np.sign(lam), axis=-1, keepdims=True) < 0, -1.0, 1.0)
         c, lam = c * sign, lam * sign
-        err2 = np.einsum("dsk,dnkl,dsl->dsn", c, M, c) / np.maximum(seen[:, 1:].sum(1), 1)
+        forms = np.stack([M[..., 0, 0], 2 * M[..., 0, 1], M[..., 1, 1]])     # c' M c as one product
+        squares = np.stack([c[..., 0] ** 2, c[..., 0] * c[..., 1], c[..., 1] ** 2], axis=-1)
+        err2 = squares @ np.moveaxis(forms, 0, 1) / np.maximum(seen[:, 1:].sum(1), 1)
         err2 = err2 / np.maximum(lam, 1e-3) ** 2
         good = np.clip(1 - err2 / tol**2, 0, None) * (lam > 0) * (motion2 > tol**2)
-        score = np.einsum("dsn,n->ds", good, weight)
+        score = good @ weight
         best = np.argsort(-score, axis=None)[: 4 * keep]
         for flat in best:
             d, s = np.unravel_index(flat, score.shape)
