@@ -28,7 +28,7 @@ from taa_envs.files import folder_written_whole
 from taa_envs.surface import Link, link_inertia, write_convex_part, write_textured_obj
 
 # A video carries no forces: these are assumptions, and asset.json says so.
-DENSITY = 300.0  # kg/m3 of the closed surface: sheet and foam, not solid steel
+DENSITY = 500.0  # kg/m3 of the closed surface: wood, or plastic and sheet with air between
 STOP_TIME = 0.2  # s in which friction alone stops the link from the demonstration's speed
 DAMPING_TIME = 0.1  # s, time constant of viscous decay
 HAND_FORCE = (0.5, 8.0)  # N at the link's far end: least and most that friction, and as much that damping, may ask

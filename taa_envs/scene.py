@@ -92,10 +92,11 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
     return quat
 
 
-def _add_cameras(spec: mujoco.MjSpec, asset: Asset, centre: np.ndarray, size: float) -> None:
+def _add_cameras(spec: mujoco.MjSpec, asset: Asset, swept: np.ndarray) -> None:
+    """``video`` where the asset knows it; ``overview`` from that side, of all that the links sweep (2, 3)."""
     import mujoco
 
-    view = np.array([1.0, -1.0, 0.7])
+    centre, view = swept.mean(0), np.array([1.0, -1.0, 0.7])
     if asset.camera is not None:
         camera = asset.camera
         K, T = np.array(camera["K"], float), np.array(camera["T_camera_world"], float)
@@ -109,7 +110,8 @@ def _add_cameras(spec: mujoco.MjSpec, asset: Asset, centre: np.ndarray, size: fl
             principal_pixel=[(width - 1) / 2 - K[0, 2], (height - 1) / 2 - K[1, 2]])
         view = position - centre
     view = view / np.linalg.norm(view)
-    position = centre + view * size * 1.9
+    view[2] = max(view[2], 0.4)  # never along the floor, from where one sees edges only
+    position = centre + view / np.linalg.norm(view) * 1.5 * np.linalg.norm(swept[1] - swept[0])
     spec.worldbody.add_camera(name="overview", pos=position, quat=_quaternion(look_at(position, centre)), fovy=45,
                               proj=mujoco.mjtProjection.mjPROJ_PERSPECTIVE)
 
@@ -167,7 +169,7 @@ def build_spec(asset: Asset, hand: Hand | None, *, touch_static: bool = False) -
     spec.visual.map.znear = 0.005
     spec.visual.map.shadowclip = 10.0  # wide enough that the shadow map's rim, which flickers, is out of sight
     spec.stat.center, spec.stat.extent = centre, size
-    _add_cameras(spec, asset, centre, size)
+    _add_cameras(spec, asset, swept)
     if hand is not None:
         hand.attach(spec)
         for geom in spec.geoms:

@@ -47,7 +47,8 @@ class PointsHand:
 
     Attributes:
         tip_radius, radius: m, of finger tips and of the other spheres.
-        mass: kg a sphere. Light, so that where hand and link overlap it is the hand that gives way.
+        mass: kg a sphere; all together a hand and some of its forearm. Light beside most links, so that where the two
+            overlap the hand gives way; heavy enough not to follow the landmarks' jitter from frame to frame.
         stiffness: N/m of each position actuator; damping is critical.
         sphere_force: N, limit of each actuator (one axis of one sphere).
         total_force: N, limit of the sum over spheres.
