@@ -158,8 +158,8 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
     shape = LinkShape(geometry.moving)
     moving = moving_frames(fit, time)
-    surface = np.asarray(geometry.moving.vertices, float)
-    drive = find_drive(hands, fit, time, surface if fit.points is None else np.concatenate([surface, fit.points]))
+    points = shape.points if fit.points is None else np.concatenate([shape.points, fit.points])
+    drive = find_drive(hands, fit, time, points)
     if drive.index is None:
         why = "no hand was seen" if not hands.tracks else "no hand moves with the part while it moves"
         return _absent(video, fit, shape, f"{why}: the demonstration holds no hand that drives the part")
@@ -190,7 +190,7 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     grips = find_grips(shape, fit, sign, rest, ray / np.linalg.norm(ray))
     if not grips:
         notes.append("no face of the part looks against its motion within the hand's reach: pose left as seen")
-        grips = [Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0.0)]
+        grips = [Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0, 0.0)]
     made = [(grip, _assemble(fit, shape, world, pose, attached, grip, rest, rate)) for grip in grips]
 
     def reference(joints: np.ndarray, words: list[str]) -> HandReference:
@@ -211,6 +211,8 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     grip, joints = made[chosen]
     words = [f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
              f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was seen"]
+    if grip.hidden > 1:
+        words.append("the part would hide this hand from the camera: the geometry lacks what the hand really held")
     if progress is not None:
         words.append(f"replayed against the passive joint: progress {progress:.2f} with candidate {chosen + 1} "
                      f"of {len(made)}")

@@ -103,17 +103,26 @@ def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndar
             if tell.sum() < 3:  # too little motion to tell a moving hand from a resting one: look longer
                 continue
             own = hand.uv[b, CONTACT] - hand.uv[a, CONTACT]
-            share = np.mean(np.linalg.norm(own - part, axis=1)[tell] < AGREE * stride[tell])
-            agree[t], differ[t] = share >= 0.3, share < 0.15
+            unit, own = part[tell] / stride[tell, None], own[tell] / stride[tell, None]
+            agree[t] = np.mean(np.linalg.norm(own - unit, axis=1) < AGREE) >= 0.3
+            # Faster or slower along the part's way is doubt; standing still or going elsewhere is contradiction.
+            along = (own * unit).sum(1)
+            aside = np.linalg.norm(own - along[:, None] * unit, axis=1)
+            differ[t] = np.mean((along < 0.3) | (aside > 1.0)) > 0.6
             break
     return away, agree, differ
 
 
-def _extend(attached: np.ndarray, moving: np.ndarray, beside: np.ndarray, differ: np.ndarray) -> np.ndarray:
-    """Over the neighbouring frames of one movement: a part that a hand moves was moved by it from the beginning."""
+def _extend(attached: np.ndarray, moving: np.ndarray, near: np.ndarray, beside: np.ndarray, differ: np.ndarray
+            ) -> np.ndarray:
+    """Over the neighbouring frames of one movement.
+
+    Something set the part in motion, so a hand that is at it from the beginning and is seen to drive it later did. The
+    end is another matter: a part can go on after it was let go.
+    """
     out = attached.copy()
     for a, b in runs(attached):
-        while a > 0 and moving[a - 1] and beside[a - 1] and not differ[a - 1]:
+        while a > 0 and moving[a - 1] and (near[a - 1] or (beside[a - 1] and not differ[a - 1])):
             a -= 1
         while b < len(out) and moving[b] and beside[b] and not differ[b]:
             b += 1
@@ -175,7 +184,7 @@ def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarra
         return Drive(None, nobody, nobody, nobody)
     index, near, drives, beside, differ = best
     valid = hands.tracks[index].valid
-    attached = _extend(close_gaps(drives, 4), moving, beside, differ)
+    attached = _extend(close_gaps(drives, 4), moving, near, beside, differ)
     # Between two driven stretches a hand that never leaves the part rests on it.
     stretches = runs(attached)
     for (_, a), (b, _) in zip(stretches, stretches[1:], strict=False):

@@ -3,7 +3,8 @@
 All in the link's frame, where a hand that drives the link is still. A grip puts finger tips (or the thumb) on faces of
 the link that look against the motion, pressed in by a few millimetres because position actuators push only with the
 distance that they are behind; the thumb takes the other side where it reaches. Among all grips the one nearest to what
-was seen comes first: cheap along the viewing ray, where a single view is blind, dear across it.
+was seen comes first: cheap along the viewing ray, where a single view is blind, dear across it, and with the palm in
+the camera's sight.
 """
 
 from __future__ import annotations
@@ -18,10 +19,13 @@ from reconstruct.hand.skeleton import FINGERS, reach
 from reconstruct.joint.models import JointFit
 
 PRESS = 0.004  # m by which pushing tips are aimed below the surface
-RAY_STD, ACROSS_STD = 0.05, 0.018  # m, what the image says about the hand's place along and across the viewing ray
+RAY_STD, ACROSS_STD = 0.05, 0.025  # m, what the image says about the hand along and across the viewing ray
 TURN_STD = np.deg2rad(25.0)
 AGAINST = -0.55  # cosine between a pushed face's normal and the motion
 FINGER_REACH = 0.035  # m by which a finger may be bent onto the surface
+OCCLUDED = 9.0  # cost of each palm landmark that the link would hide from the camera
+PALM = (0, 2, 5, 9, 13, 17)
+AHEAD = np.array([0.01, 0.025, 0.045, 0.07, 0.1, 0.15])  # m towards the camera
 GROUPS = ((8, 12, 16), (8, 12), (8, 12, 16, 20), (4,), (4, 8, 12))
 """Finger tips that push together."""
 
@@ -34,6 +38,7 @@ class Grip:
         kind: "push" or "pinch" (thumb on the other side).
         shift: (3,) m and turn: rad, how the hand was moved from where it was seen.
         pushing: number of contact spheres on faces that look against the motion.
+        hidden: number of palm landmarks that the link would hide from the camera.
         cost: smaller is nearer to the evidence.
     """
 
@@ -42,6 +47,7 @@ class Grip:
     shift: np.ndarray
     turn: float
     pushing: int
+    hidden: int
     cost: float
 
 
@@ -83,6 +89,12 @@ def _overlap_cost(deep: np.ndarray, tips: tuple[int, ...]) -> np.ndarray:
     allowed = np.full(deep.shape[-1], 0.002)
     allowed[list(tips)] = PRESS + 0.004
     return (np.minimum(np.maximum(deep - allowed, 0.0) / 0.004, 5.0) ** 2).sum(-1)
+
+
+def _hidden(shape: LinkShape, poses: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """(...,) how many palm landmarks lie behind the link: hands were seen, so hardly any can."""
+    ahead = poses[..., list(PALM), None, :] - AHEAD[:, None] * ray
+    return (shape.distance(ahead)[0] < -0.002).any(-1).sum(-1)
 
 
 def _bend(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, tips: tuple[int, ...], faces: np.ndarray
@@ -134,7 +146,10 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
         along = d @ ray
         across = np.linalg.norm(d - along[:, None] * ray, axis=1)
         prior = (along / RAY_STD) ** 2 + (across / ACROSS_STD) ** 2
-        near = np.argsort(prior)[:80]
+        # All places with the hand as it was seen, then the promising ones turned as well.
+        poses = (seen - anchor)[None] + aims[:, None]
+        rough = prior + _overlap_cost(penetration(shape, poses), tips) + OCCLUDED * _hidden(shape, poses, ray)
+        near = np.unique(np.concatenate([np.argsort(rough)[:60], np.argsort(prior)[:40]]))
         best: list[tuple[float, int, int]] = []
         for k, turn in enumerate(turns):
             turned = turn.apply(seen - anchor)
@@ -144,6 +159,7 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
             # Tips that float far off the surface cannot all be bent onto it.
             off = np.maximum(shape.distance(x)[0] - 0.02, 0).sum(1) / 0.02
             cost = prior[near] + (turn.magnitude() / TURN_STD) ** 2 + _overlap_cost(deep, tips) + off
+            cost = cost + OCCLUDED * _hidden(shape, poses, ray)
             best += [(float(cost[j]), int(near[j]), k) for j in np.argsort(cost)[:4]]
         for _, j, k in sorted(best)[:10]:
             turn = turns[k]
@@ -159,8 +175,11 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
             pushing = int(_pushing(shape, fit, sign, bent).sum())
             wrong = _overlap_cost(penetration(shape, bent), (*tips, 4) if kind == "pinch" else tips)
             cost = prior[j] + (turn.magnitude() / TURN_STD) ** 2 + wrong + 4.0 * max(0, 3 - pushing) + 0.3 * g
+            hidden = int(_hidden(shape, bent, ray))
+            cost += OCCLUDED * hidden
             if pushing:
-                found.append((float(cost), Grip(bent, kind, aims[j] - anchor, turn.magnitude(), pushing, float(cost))))
+                shift, angle = aims[j] - anchor, float(turn.magnitude())
+                found.append((float(cost), Grip(bent, kind, shift, angle, pushing, hidden, float(cost))))
     found.sort(key=lambda item: item[0])
     out: list[Grip] = []
     for _, grip in found:
