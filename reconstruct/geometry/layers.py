@@ -214,6 +214,8 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
     hand = np.stack([cv2.dilate(window.crop(hands.mask[t]).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
                      for t in frames])
     H = S @ homography(fit, plane, fit.q[frames])
+    path = np.stack([warp_to_image(chart, seed, h_t, size) for h_t in H])
+    images = level_exposure(images, path | hand)
     centres = chart.centres()
     uv = np.stack([apply_homography(h_t, centres) for h_t in H])
     inside = np.isfinite(uv).all(-1) & (uv > 1).all(-1) & (uv < np.array(size) - 2).all(-1)
@@ -246,14 +248,29 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
     return Evidence(chart, occupied, score, seen, frames)
 
 
+def contradicted(evidence: Evidence, fit: JointFit, plane: LinkPlane) -> np.ndarray:
+    """(M,) bool: points in whose surroundings the pixels say "background" (crossings of edges, reflections)."""
+    import cv2
+
+    cell = np.round((plane.to_plane(fit.points)[:, :2] - evidence.chart.origin) / evidence.chart.cell).astype(int)
+    rows, cols = evidence.chart.shape
+    inside = (cell >= 0).all(1) & (cell[:, 0] < cols) & (cell[:, 1] < rows)
+    cell = cell.clip(0, [cols - 1, rows - 1])
+    # The best cell within reach: a point at the rim is off the plane or off the outline by a little.
+    near = np.ones((7, 7), np.uint8)
+    best = cv2.dilate(evidence.score.astype(np.float32), near)[cell[:, 1], cell[:, 0]]
+    seen = evidence.seen[cell[:, 1], cell[:, 0]]
+    return inside & (seen >= 4) & (best < 0.1)
+
+
 def _noise(video: Video, window: Window, frames: np.ndarray) -> float:
     """Typical difference of one unmoved pixel between two frames, in the units of :func:`to_lab`."""
     if len(frames) < 2:
-        return 4.0
+        return 5.0
     late = [min(int(t) + 1, len(video) - 1) for t in frames[:: max(1, len(frames) // 4)]]
     pairs = [(to_lab(window.crop(video.frames[t])), to_lab(window.crop(video.frames[t - 1]))) for t in late if t]
     miss = [np.median(np.linalg.norm(a - b, axis=-1)) for a, b in pairs]
-    return float(np.clip(2.5 * np.median(miss), 3.0, 12.0)) if miss else 4.0
+    return float(np.clip(2.5 * np.median(miss), 5.0, 12.0)) if miss else 5.0
 
 
 def _link_residual(warped: np.ndarray, usable: np.ndarray, uv: np.ndarray, facing: np.ndarray,
@@ -282,6 +299,16 @@ def _link_residual(warped: np.ndarray, usable: np.ndarray, uv: np.ndarray, facin
     return out
 
 
+def level_exposure(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Take the camera's automatic exposure out: shift each frame's lightness so that what nothing covers agrees."""
+    free = np.where(covered, np.nan, images[..., 0])[:, ::2, ::2]
+    usual = np.nanmedian(np.where(np.isfinite(free).sum(0) > 0, free, 0.0), axis=0)
+    shift = np.array([np.nanmedian(f - usual) if np.isfinite(f).any() else 0.0 for f in free], np.float32)
+    out = images.copy()
+    out[..., 0] -= shift[:, None, None]
+    return out
+
+
 def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """How far each pixel is from its own colours in the frames in which nothing covers it.
 
@@ -290,8 +317,8 @@ def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
         covered: (F, h, w) bool, link or hand.
 
     Returns:
-        (F, h, w), -1 where fewer than two other frames show the background. The lower quartile, so that a
-        passing reflection does not count against it; a pixel that only grew darker by a shadow's amount,
+        (F, h, w), -1 where fewer than two other frames show the background. A low quantile, since the link is
+        likewise compared with its nearest looks only; a pixel that only grew darker by a shadow's amount,
         its colour kept, counts for less.
     """
     F = len(images)
@@ -309,7 +336,7 @@ def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
         d[k] = np.inf
         d.sort(axis=0)
         count = np.isfinite(d).sum(0)
-        pick = np.clip((count - 1) // 4, 0, F - 1)
+        pick = np.clip((count - 1) // 8, 0, F - 1)
         value = np.take_along_axis(d, pick[None], 0)[0]
         out[k] = np.where(count >= 2, value, -1)
     return out
@@ -326,8 +353,8 @@ def _smooth(score: np.ndarray, seen: np.ndarray, seed: np.ndarray, warped: np.nd
     rows, cols = score.shape
     texture = np.where(usable[..., None], warped, 0).sum(0) / np.maximum(usable.sum(0), 1)[..., None]
     trust = np.clip(seen / 6.0, 0, 1)
-    # Bare walls and table tops match under either motion: outside the seed such a tie goes to the background.
-    target = np.clip(score - np.where(seed, 0.0, 0.2), -1.5, 1.5)
+    # Bare walls and table tops match under either motion: such a tie goes to the background.
+    target = np.clip(score - np.where(seed, 0.2, 0.35), -1.5, 1.5)
     # Without votes: the seed is link by construction, the rim of the chart is not.
     pull = trust + 0.02
     target = (trust * target + 0.02 * np.where(seed, 1.0, -0.5)) / pull

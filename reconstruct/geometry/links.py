@@ -11,8 +11,9 @@ from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
 from reconstruct.geometry.layers import make_window, spread_frames, to_lab
+from reconstruct.geometry.masks import points_on_mask
 from reconstruct.geometry.outline import Shape, build_shape
-from reconstruct.geometry.plane import LinkPlane, fit_plane
+from reconstruct.geometry.plane import LinkPlane, fit_plane, keep_points
 from reconstruct.geometry.solids import carve, extrude, hull, static_box, swept_hulls, to_arrays
 from reconstruct.geometry.texture import paint, subdivide
 from reconstruct.joint.models import JointFit
@@ -45,6 +46,10 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
     started = time.perf_counter()
     notes: list[str] = []
     plane = fit_plane(tracks, fit)
+    good = points_on_mask(video, tracks, fit, masks)
+    if not good.all():
+        notes.append(f"{int((~good).sum())} of {len(good)} fitted points lie off the moving silhouette; left out")
+        fit, plane = keep_points(fit, plane, good)
     shape = build_shape(video, hands, fit, plane, masks)
     solid = extrude(shape, plane)
     vertices, faces = to_arrays(solid)
@@ -128,11 +133,12 @@ def closed_end(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mask
                clearance: float) -> tuple[float, dict, bool]:
     """Which end of the range is the closed one: there the body lies right behind the link.
 
-    A body and its door, lid or arm are mostly of one make, while floors and walls are not: the block
-    assumed at each end is drawn into the image, and its colours are compared with the link's.
+    A body and its door, lid or arm are mostly of one make, while floors and walls are not, and a hand does
+    not reach through a body: the block assumed at each end is drawn into the image, its colours are compared
+    with the link's, and the share of it that hands cover counts against it.
 
     Returns:
-        The state, {"start", "other"} colour likenesses in [0, 1], and whether they differ enough to decide.
+        The state, {"start", "other"} likenesses in [0, 1], and whether they differ enough to decide.
     """
     import cv2
 
@@ -143,6 +149,7 @@ def closed_end(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mask
     images = np.stack([to_lab(window.crop(video.frames[t])) for t in frames])
     kernel = np.ones((5, 5), np.uint8)
     link = np.stack([window.crop(masks.moving[t]) for t in frames])
+    hand = np.stack([window.crop(masks.hand[t]) for t in frames])
     free = ~np.stack([cv2.dilate(window.crop(masks.moving[t] | masks.hand[t]).astype(np.uint8), kernel) > 0
                       for t in frames])
     mean = _histogram(images[link])
@@ -158,7 +165,9 @@ def closed_end(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mask
         # Leave out the hollow behind the closed link: only it and the moving part were ever there.
         here = (region > 0) & ~path
         pixels = np.concatenate([images[k][here & free[k]] for k in range(len(frames))])
-        scores.append(float(np.minimum(_histogram(pixels), mean).sum()) if len(pixels) > 50 else 0.0)
+        likeness = float(np.minimum(_histogram(pixels), mean).sum()) if len(pixels) > 50 else 0.0
+        reached = float(hand[:, here].mean()) if here.any() else 0.0
+        scores.append(likeness * (1 - min(1.0, 2 * reached)))
     first = int(np.argmin(np.abs(np.array(ends) - fit.q[0])))
     likeness = {"start": scores[first], "other": scores[1 - first]}
     chosen = first if scores[first] >= scores[1 - first] else 1 - first

@@ -8,13 +8,15 @@ from reconstruct.cues import Hands, LinkMasks, Tracks
 from reconstruct.geometry.layers import (
     Evidence,
     background_residual,
+    contradicted,
     gather,
+    level_exposure,
     make_window,
     spread_frames,
     to_lab,
     warp_to_image,
 )
-from reconstruct.geometry.plane import LinkPlane, apply_homography, fit_plane, homography, working_matrix
+from reconstruct.geometry.plane import LinkPlane, apply_homography, fit_plane, homography, keep_points, working_matrix
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -45,6 +47,10 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
     T, h, w = video.frames.shape[:3]
     plane = fit_plane(tracks, fit)
     evidence = gather(video, hands, fit, plane)
+    stray = contradicted(evidence, fit, plane)
+    if 0.05 * len(stray) < stray.sum() <= len(stray) - 5:
+        fit, plane = keep_points(fit, plane, ~stray)
+        evidence = gather(video, hands, fit, plane)
     keys = spread_frames(fit, hands.mask, KEY_FRAMES)
     cut, agreement = _cut_keys(video, hands, fit, plane, evidence, keys)
 
@@ -74,6 +80,28 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
     return LinkMasks(moving, static, hands.mask.copy(), confidence)
 
 
+def points_on_mask(video: Video, tracks: Tracks, fit: JointFit, masks: LinkMasks) -> np.ndarray:
+    """(M,) bool: points whose tracks lie on (or within a hundredth of the diagonal of) the moving silhouette in at
+    least half of the frames that show them; all, if fewer than five do."""
+    import cv2
+
+    idx = np.asarray(fit.point_track, int)
+    T, h, w = masks.moving.shape
+    hit, count = np.zeros(len(idx)), np.zeros(len(idx))
+    kernel = _disc(max(2, int(0.01 * np.hypot(h, w))))
+    for t in range(0, T, max(1, T // 40)):
+        uv = video.to_work(tracks.uv[idx, t])
+        px = np.nan_to_num(uv, nan=-9.0).round().astype(int)
+        ok = tracks.visible[idx, t] & (px >= 0).all(1) & (px[:, 0] < w) & (px[:, 1] < h)
+        px = px.clip(0, [w - 1, h - 1])
+        ok &= ~masks.hand[t][px[:, 1], px[:, 0]]
+        near = cv2.dilate(masks.moving[t].astype(np.uint8), kernel)[px[:, 1], px[:, 0]] > 0
+        hit += ok & near
+        count += ok
+    good = hit >= 0.5 * count
+    return good if good.sum() >= 5 else np.ones(len(idx), bool)
+
+
 def _largest_shift(M: np.ndarray, mask: np.ndarray) -> float:
     """How far, px, the homography moves the corners of a mask's bounding box."""
     rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
@@ -97,7 +125,7 @@ def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evide
                         for h_t in homography(fit, plane, fit.q[keys])])
     reach = max(3, int(0.12 * np.sqrt(max(outline.sum((1, 2)).max(), 1))))
     wide = np.stack([cv2.dilate(m.astype(np.uint8), _disc(reach)) > 0 for m in outline])
-    images = np.stack([to_lab(f) for f in small])
+    images = level_exposure(np.stack([to_lab(f) for f in small]), wide | hand)
     # Frames of the cut and of the evidence share the noise level; the residual decides "changed" against it.
     change = background_residual(images, wide | hand)
     quiet = change[(change >= 0) & ~wide & ~hand]

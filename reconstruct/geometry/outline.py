@@ -244,7 +244,7 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
     outline, reach = _reach_hand(outline, hold_points(hands, fit, plane))
     extent = float(np.hypot(*(np.array(outline.bounds[2:]) - outline.bounds[:2])))
     unseen = 0.03 * extent
-    if plane.kind == "across the axis" and fit.type != "prismatic":
+    if fit.type != "prismatic" and abs(float(plane.pose[:3, 2] @ fit.axis)) > 0.8:
         # A lever seen along its hinge: as deep as it is high, more or less, not a sheet.
         sides = np.asarray(outline.minimum_rotated_rectangle.exterior.coords)
         unseen = 0.7 * float(np.linalg.norm(np.diff(sides[:3], axis=0), axis=1).min())
@@ -271,7 +271,9 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
     else:
         (low, high), origin = assumed, "assumed"
     slab = Shape((Slice(outline, low, high),), draw(low, high), origin, "slab", reach)
-    stack = _stack(views, fit, plane, chart, slab, extent)
+    # A link seen from one side only gives its silhouettes no say about depth: a hull would be a guess in 16 parts.
+    turned = float(np.ptp(np.abs(plane.facing[views.frames]))) > 0.25
+    stack = _stack(views, fit, plane, chart, slab, extent) if turned else None
     return stack if stack is not None and stack.iou > slab.iou + 0.03 else slab
 
 

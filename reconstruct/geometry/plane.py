@@ -9,7 +9,7 @@ cut with the plane at one frame, moved with the joint, and compared with the tra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,14 @@ class LinkPlane:
         if uvn.shape[-1] == 2:
             uvn = np.concatenate([uvn, np.zeros((*uvn.shape[:-1], 1))], axis=-1)
         return uvn @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+def keep_points(fit: JointFit, plane: LinkPlane, good: np.ndarray) -> tuple[JointFit, LinkPlane]:
+    """The fit and the plane without some of the points; the plane itself stays, as a chart must not jump."""
+    few = good & plane.inlier
+    good = good if few.sum() >= 3 else good | plane.inlier
+    return (replace(fit, points=np.asarray(fit.points)[good], point_track=np.asarray(fit.point_track)[good]),
+            replace(plane, inlier=plane.inlier[good], spread=plane.spread[good]))
 
 
 def working_matrix(video: Video, scale: float = 1.0) -> np.ndarray:
