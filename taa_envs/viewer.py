@@ -106,5 +106,8 @@ def _mesh(spec: mujoco.MjSpec, geom: object, folder: Path) -> trimesh.Trimesh:
     uv = getattr(mesh.visual, "uv", None)
     if textures and uv is not None:
         with Image.open(folder / spec.texturedir / textures[0]) as picture:
-            mesh.visual = trimesh.visual.TextureVisuals(uv=uv, image=picture.convert("RGB"))
+            paper = trimesh.visual.material.PBRMaterial(
+                baseColorTexture=picture.convert("RGB"), metallicFactor=0.0, roughnessFactor=1.0
+            )
+        mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=paper)
     return mesh
