@@ -19,7 +19,7 @@ from reconstruct.hand.grip import RADII, SPHERES, Grip, find_grips
 from reconstruct.hand.path import clear_path, exit_direction
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.shape import LinkShape
-from reconstruct.hand.skeleton import HAND_SIZE_STD, TIPS, one_anatomy
+from reconstruct.hand.skeleton import HAND_SIZE_STD, TIPS, bone_lengths, with_bone_lengths
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -62,7 +62,9 @@ def observe(hands: Hands, index: int, K: np.ndarray, rate: float) -> Seen:
     slow = _smooth(median, 0.12 * rate)
     camera = camera * np.exp(slow - depth)[:, None, None]
     centre = camera.mean(1, keepdims=True)
-    shape = one_anatomy(_smooth(camera - centre, 0.06 * rate), np.where(valid, 1.0, 0.0))
+    # Filling and smoothing shorten bones; the depth's factor has already changed them all alike.
+    lengths = np.median(bone_lengths(camera[valid]), axis=0)
+    shape = with_bone_lengths(_smooth(camera - centre, 0.06 * rate), lengths)
     return Seen(_smooth(centre, 0.03 * rate) + shape - shape.mean(1, keepdims=True), valid)
 
 
@@ -118,7 +120,7 @@ def rest_pose(link: np.ndarray, motion: np.ndarray) -> np.ndarray:
     tips = link[:, TIPS].mean(1)
     near = np.linalg.norm(tips[:, None] - tips[None], axis=-1) < 0.04
     chosen = near[int((near @ motion).argmax())]
-    return one_anatomy(np.median(link[chosen], axis=0)[None], np.ones(1))[0]
+    return with_bone_lengths(np.median(link[chosen], axis=0), np.median(bone_lengths(link[chosen]), axis=0))
 
 
 def _carried(drive: Drive, valid: np.ndarray, moving: np.ndarray, rate: float) -> np.ndarray:
@@ -148,7 +150,8 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         fit: metric joint.
         geometry: both links; the moving one's collision parts are what the hand meets.
         masks: of the links; accepted for symmetry with the other stages, the geometry carries what is needed.
-        check: replay the candidate grips against the passive joint and keep the first that drives it.
+        check: replay the candidate grips against the passive joint and keep the first that drives it while the
+            controls of the replay do not.
 
     Returns:
         The reference. Where no hand drives the part, ``hand_valid`` and ``contact`` are all False, the landmarks
@@ -204,10 +207,10 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         scores = []
         for _, joints in made:
             scores.append(replay_progress(fit, geometry, reference(joints, [])))
-            if scores[-1] >= 0.9:
+            if scores[-1][0] >= 0.9 and scores[-1][1] < 0.1:
                 break
-        chosen = int(np.argmax(scores))
-        progress = scores[chosen]
+        chosen = int(np.argmax([done - max(control - 0.1, 0.0) for done, control in scores]))
+        progress = scores[chosen][0]
     grip, joints = made[chosen]
     words = [f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
              f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was seen"]

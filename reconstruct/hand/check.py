@@ -9,8 +9,13 @@ from reconstruct.geometry import Geometry
 from reconstruct.joint.models import JointFit
 
 
-def replay_progress(fit: JointFit, geometry: Geometry, reference: HandReference) -> float:
-    """Joint progress in [0, 1] of the open-loop replay; 0 where the simulation becomes unstable."""
+def replay_progress(fit: JointFit, geometry: Geometry, reference: HandReference) -> tuple[float, float]:
+    """Open-loop replay of a reference.
+
+    Returns:
+        Joint progress in [0, 1] and the largest progress of a control (1 where the replay is too poor to run them).
+        An unstable simulation counts as no progress.
+    """
     from taa_envs.authoring import save_asset
     from taa_envs.replay import Diverged, replay
 
@@ -19,6 +24,9 @@ def replay_progress(fit: JointFit, geometry: Geometry, reference: HandReference)
         asset = save_asset(folder, "trial", joint=joint, static=geometry.static, moving=geometry.moving,
                            reference=reference)
         try:
-            return replay(asset, controls=False).joint_progress
+            progress = replay(asset, controls=False).joint_progress
+            if progress < 0.7:
+                return progress, 1.0
+            return progress, max(replay(asset).controls.values())
         except Diverged:
-            return 0.0
+            return 0.0, 1.0

@@ -67,7 +67,7 @@ def hand_positions(hand: HandTrack, K: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     n = len(hand.valid)
     out, std = np.full((n, 21, 3), np.nan), np.full(n, np.nan)
-    metric = one_anatomy(np.where(hand.valid[:, None, None], hand.metric, np.nan), hand.score)
+    metric = one_anatomy(np.where(hand.valid[:, None, None], hand.metric, np.nan))
     for t in np.flatnonzero(hand.valid):
         noise = PIXEL_STD * max(float(palm_pixels(hand.uv[t])), 1.0)
         placed = _place(metric[t], hand.uv[t], K if K.ndim == 2 else K[t], noise)

@@ -109,14 +109,14 @@ def test_position_from_one_view() -> None:
     assert np.isnan(camera[~valid]).all() and np.isnan(std[~valid]).all()
     depth, wanted = camera[valid][..., 2].mean(1), true[valid][..., 2].mean(1)
     assert np.median(np.abs(depth / wanted - 1)) < 0.06
-    assert (std[valid] >= 0.119 * depth).all()
+    assert (std[valid] >= 0.149 * depth).all()
 
 
 def test_one_anatomy_keeps_directions() -> None:
     rng = np.random.default_rng(0)
     joints = rng.normal(0, 0.05, (6, 21, 3))
     joints[2] = np.nan
-    out = one_anatomy(joints, np.ones(6))
+    out = one_anatomy(joints)
     assert np.isnan(out[2]).all()
     seen = np.delete(out, 2, axis=0)
     np.testing.assert_allclose(bone_lengths(seen), np.broadcast_to(bone_lengths(seen)[0], (5, 21)), atol=1e-9)
