@@ -165,7 +165,7 @@ def refine(s: State, obs: Observations, scales: tuple[float, ...] = (8.0, 4.0, 2
                 ct, wt = robust_cost(rt, obs, scale)
                 ct += float(trial.q @ prior @ trial.q)
                 if ct < cost:
-                    improved = ct < cost * (1 - 1e-5)
+                    improved = ct < cost * (1 - 1e-6)
                     s, X, D, r, w, cost = trial, Xt, Dt, rt, wt, ct
                     damping = max(damping / 5, 1e-7)
                     break

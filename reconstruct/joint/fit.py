@@ -80,10 +80,13 @@ def fit_joint(video: Video, tracks: Tracks, focal_px: float | None = None, seed:
         return JointFit("refused", refusal, tracks=len(uv), inliers=int(link.sum()), type_probability=probability)
     tell(0.9)
 
+    # Directions that the data hardly hold (an axis towards the camera) converge slowly: finish on the link alone.
+    own = Observations(every.xy[link], every.seen[link], every.ref[link], every.weight[link], every.px, every.frames)
+    s = refine(replace(s, depth=s.depth[link]), own, scales=(2.0,), iterations=60)
     members = moving[ids[link]]
     T = len(video)
     dense = _all_frames(uv[members], focal, centre, every, link, T)
-    s = replace(s, q=np.interp(np.arange(T), keys, s.q), depth=s.depth[link])
+    s = replace(s, q=np.interp(np.arange(T), keys, s.q))
     s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
     std = joint_std(s, dense, focal_std=FOCAL_STD if not (focal_px or video.focal_px) else 0.02)
     tell(1.0)

@@ -260,9 +260,34 @@ def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: 
         states.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
         fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in _distinct(states, fine)]
         fined.sort(key=lambda s: -explained(s, obs)[0])
-        out += [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
+        last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
+        if kind == "revolute":
+            last += [refine(_tilted_back(s, obs), obs, scales=(4.0, 2.0), iterations=20) for s in last[:2]]
+        out += last
         progress(0.8 if kind == "revolute" else 1.0)
     return sorted(out, key=lambda s: -explained(s, obs)[0])
+
+
+def _tilted_back(s: State, obs: Observations) -> State:
+    """The twin of a joint whose axis leans towards the other side of the viewing ray.
+
+    Under weak perspective both draw the same ellipses; which one is right shows only in small effects, so that a
+    fit may settle in either.
+    """
+    _, per = explained(s, obs)
+    X, _ = transport(s, obs)
+    on_link = obs.seen & (per > 0.5)[:, None]
+    if not on_link.any():
+        return s
+    P = np.median(X[on_link], axis=0)
+    centre = s.point + s.axis * ((P - s.point) @ s.axis)
+    ray = centre / np.linalg.norm(centre)
+    axis = 2 * (s.axis @ ray) * ray - s.axis
+    point = centre - (centre @ axis) * axis
+    size = np.linalg.norm(point)
+    if size < 1e-6:
+        return s
+    return solve_depths(replace(s, axis=axis, point=point / size), obs)
 
 
 def _distinct(states: list[State], count: int) -> list[State]:

@@ -1,0 +1,52 @@
+"""Tracks on a turning textured plate over a textured background."""
+
+import cv2
+import numpy as np
+from tests.reconstruct.joint_scenes import make_video
+
+from reconstruct.cues import Hands, ProviderInfo
+from reconstruct.providers.lk_tracks import change_region, reference_frames, track_points
+from tests.reconstruct.textures import turning_plate
+
+
+def test_tracks_follow_the_plate_and_stay_off_hands():
+    frames, H = turning_plate(24)
+    video = make_video(len(frames)).with_frames(frames)
+    mask = np.zeros(frames.shape[:3], bool)
+    mask[:, 150:190, 200:260] = True
+    hands = Hands((), mask, ProviderInfo("made", "0", "Apache-2.0"))
+    tracks = track_points(video, hands)
+    extent = np.linalg.norm(np.nanmax(tracks.uv, axis=1) - np.nanmin(tracks.uv, axis=1), axis=-1)
+    moving = np.flatnonzero((extent > 10) & (tracks.visible.sum(1) > 8))
+    assert len(moving) > 40
+    errors = []
+    for i in moving:
+        r = tracks.reference[i]
+        t = np.flatnonzero(tracks.visible[i])
+        base = cv2.perspectiveTransform(tracks.uv[i, r].reshape(1, 1, 2).astype(float), np.linalg.inv(H[r]))
+        truth = np.array([cv2.perspectiveTransform(base, H[k])[0, 0] for k in t])
+        errors.append(np.median(np.linalg.norm(truth - tracks.uv[i, t], axis=-1)))
+    assert np.median(errors) < 1.0
+    # No visible observation under the hand.
+    n, t = np.nonzero(tracks.visible)
+    u, v = np.round(tracks.uv[n, t]).astype(int).T
+    assert not mask[t, v, u].any()
+    # Seeds come from several frames and are followed both ways.
+    assert len(set(tracks.reference)) > 5
+    both = [(tracks.visible[i, : tracks.reference[i]].any() and tracks.visible[i, tracks.reference[i] + 1 :].any()) for i in moving]
+    assert np.mean(both) > 0.3
+
+
+def test_change_region_covers_the_motion_only():
+    frames, _ = turning_plate(10)
+    region = change_region(make_video(10).with_frames(frames))
+    assert region[150:250, 200:300].mean() > 0.5
+    assert region[:60].mean() < 0.05
+
+
+def test_reference_frames_follow_the_motion():
+    frames, _ = turning_plate(20)
+    still = np.concatenate([np.repeat(frames[:1], 20, axis=0), frames])
+    refs = reference_frames(make_video(40).with_frames(still))
+    assert refs[0] == 0 and refs[-1] == 39
+    assert (refs > 19).sum() > 2 * (refs <= 19).sum()
