@@ -47,8 +47,9 @@ LEFT_OUT := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cubla
   nvidia-cuda-cupti nvidia-cuda-nvrtc nvidia-cuda-runtime nvidia-cudnn-cu13 nvidia-cufft nvidia-cufile \
   nvidia-curand nvidia-cusolver nvidia-cusparse nvidia-cusparselt-cu13 nvidia-nccl-cu13 nvidia-nvjitlink \
   nvidia-nvshmem-cu13 nvidia-nvtx
+# uv does not look at upper bounds of Requires-Python: backports-strenum 1.3 is for Python 3.10 and older.
 lock:
-	echo "$(TORCH)" | uv pip compile pyproject.toml --extra dev --constraints - --universal --python-version 3.11 \
+	printf '%s\n' "$(TORCH)" "backports-strenum<1.3" | uv pip compile pyproject.toml --extra dev --constraints - --universal --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet \
 	  $(addprefix --no-emit-package ,$(LEFT_OUT)) --output-file requirements.lock
 

@@ -205,7 +205,7 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     given = folder.given() if folder else {}
     camera = folder.read("camera", "K") if folder and "camera" in given else None
     stages.inputs.update(video=video.sha256, frames=[len(video), *video.frames.shape[1:3]], camera=given.get("camera"))
-    if folder:
+    if folder and scene:
         folder.write("frames", {"time": video.time})
         cues_io.save_facts(scene, video)
 

@@ -294,7 +294,7 @@ def _frame_store(shape: tuple[int, int, int, int], scratch: Path | None) -> np.m
             shutil.rmtree(folder, ignore_errors=True)
         raise
     if scratch is None:
-        weakref.finalize(store._mmap, shutil.rmtree, folder, True)
+        weakref.finalize(store._mmap, shutil.rmtree, folder, True)  # type: ignore[attr-defined]
     return store
 
 

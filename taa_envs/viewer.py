@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from taa_envs.asset import Asset
 
 if TYPE_CHECKING:
     import mujoco
-    import trimesh
     import viser
 
 BONES = ((0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8), (5, 9), (9, 10), (10, 11), (11, 12), (9, 13),
@@ -95,12 +94,12 @@ def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
     return server
 
 
-def _mesh(spec: mujoco.MjSpec, geom: object, folder: Path) -> trimesh.Trimesh:
+def _mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, folder: Path) -> Any:
     """The mesh file of a visual geom, with its material's picture."""
     import trimesh
     from PIL import Image
 
-    mesh = trimesh.load(folder / spec.meshdir / spec.mesh(geom.meshname).file, force="mesh", process=False)
+    mesh: Any = trimesh.load(folder / spec.meshdir / spec.mesh(geom.meshname).file, force="mesh", process=False)
     material = spec.material(geom.material) if geom.material else None
     textures = [spec.texture(name).file for name in material.textures if name] if material is not None else []
     uv = getattr(mesh.visual, "uv", None)
