@@ -57,8 +57,12 @@ def estimate_camera_motion(video: Video, seed: int = 0) -> CameraMotion:
     alive = np.ones(len(points), bool)
     for t in range(1, T):
         grey = cv2.cvtColor(frames[t], cv2.COLOR_BGR2GRAY)
-        nxt, ok, _ = cv2.calcOpticalFlowPyrLK(grey0, grey, points, guess.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **lk)
-        back, ok2, _ = cv2.calcOpticalFlowPyrLK(grey, grey0, nxt, points.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **lk)
+        nxt, ok, _ = cv2.calcOpticalFlowPyrLK(
+            grey0, grey, points, guess.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **lk
+        )
+        back, ok2, _ = cv2.calcOpticalFlowPyrLK(
+            grey, grey0, nxt, points.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **lk
+        )
         alive = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(back - points, axis=-1).ravel() < 1.0)
         if alive.sum() < 12:
             raise TaaError(
@@ -89,13 +93,12 @@ def stabilise(video: Video, scratch: Path | None = None, seed: int = 0) -> tuple
     A static camera's frames are returned untouched. Pixels that the moving camera did not see are
     filled with the nearest ones.
     """
-    import cv2
 
     motion = estimate_camera_motion(video, seed)
     if motion.static:
         return video, motion
     T, h, w = video.frames.shape[:3]
-    where = scratch or Path(video.frames.filename).parent
+    where = scratch or Path(video.frames.filename).parent  # type: ignore[attr-defined]  # frames are a memmap
     where.mkdir(parents=True, exist_ok=True)
     out = np.lib.format.open_memmap(where / "frames_stable.npy", mode="w+", dtype=np.uint8, shape=video.frames.shape)
     for t in range(T):

@@ -75,11 +75,11 @@ def transport(s: State, obs: Observations) -> tuple[np.ndarray, np.ndarray]:
     if s.kind == "prismatic":
         X = (s.depth[:, None] * rays)[:, None] + ((s.q[None, :] - s.q[obs.ref][:, None])[..., None] * s.axis)
         return X, np.broadcast_to(rays[:, None], X.shape)
-    dq = s.q[None, :] - s.q[obs.ref][:, None]                 # (N, K)
+    dq = s.q[None, :] - s.q[obs.ref][:, None]  # (N, K)
     cos, sin = np.cos(dq)[..., None], np.sin(dq)[..., None]
     a, c = s.axis, s.point
 
-    def rotate(v: np.ndarray) -> np.ndarray:                  # (N, 3) -> (N, K, 3), Rodrigues
+    def rotate(v: np.ndarray) -> np.ndarray:  # (N, 3) -> (N, K, 3), Rodrigues
         along = (v @ a)[:, None, None] * a
         return along + cos * (v[:, None] - along) + sin * np.cross(a, v)[:, None]
 
@@ -101,7 +101,7 @@ def solve_depths(s: State, obs: Observations, sweeps: int = 2, scale: float = 4.
     """Best depth of each track for a given joint and states (robust, linear in the depth)."""
     one = replace(s, depth=np.ones(len(obs.ref)))
     X1, D = transport(one, obs)
-    C = X1 - D                                                # X = depth * D + C
+    C = X1 - D  # X = depth * D + C
     xy = obs.xy
     # x * (depth Dz + Cz) = depth Dx + Cx, and the same for y
     A = D[..., :2] - xy * D[..., 2:]
@@ -127,8 +127,9 @@ def robust_cost(r: np.ndarray, obs: Observations, scale: float) -> tuple[float, 
     return float(np.sum(w * rho)), w * g**2
 
 
-def refine(s: State, obs: Observations, scales: tuple[float, ...] = (8.0, 4.0, 2.0), iterations: int = 12,
-           smooth: float = 0.02) -> State:
+def refine(
+    s: State, obs: Observations, scales: tuple[float, ...] = (8.0, 4.0, 2.0), iterations: int = 12, smooth: float = 0.02
+) -> State:
     """Levenberg-Marquardt over joint, states and depths with a shrinking robust scale (working px).
 
     Args:
@@ -145,7 +146,7 @@ def refine(s: State, obs: Observations, scales: tuple[float, ...] = (8.0, 4.0, 2
         prior = smooth * obs.weight.sum() * scale**2 / range_q**2 * (second.T @ second)
         cost += float(s.q @ prior @ s.q)
         for _ in range(iterations):
-            Hm, g, Hll, Hgl, gl = _normal_equations(s, obs, X, D, r, w)
+            Hm, g, Hll, Hgl, gl = normal_equations(s, obs, X, D, r, w)
             Hm[-K:, -K:] += prior
             g[-K:] += prior @ s.q
             improved = False
@@ -206,12 +207,12 @@ def _apply(s: State, step: np.ndarray, depth: np.ndarray, K: int) -> State:
     return replace(s, axis=axis, point=point / np.linalg.norm(point), q=q - q[0], depth=depth)
 
 
-def _normal_equations(s: State, obs: Observations, X, D, r, w):
+def normal_equations(s: State, obs: Observations, X, D, r, w):
     """Gauss-Newton blocks: (joint, q) dense part, per-track depth part, coupling."""
     N, K = obs.seen.shape
     z = np.maximum(X[..., 2], 1e-3)
 
-    def image(dX: np.ndarray) -> np.ndarray:                  # (N, K, 3) -> (N, K, 2) px
+    def image(dX: np.ndarray) -> np.ndarray:  # (N, K, 3) -> (N, K, 2) px
         return (dX[..., :2] - X[..., :2] / z[..., None] * dX[..., 2:]) / z[..., None] / obs.px
 
     Jl = image(D)
@@ -231,7 +232,7 @@ def _normal_equations(s: State, obs: Observations, X, D, r, w):
             Jg.append(image((Xk - X) / h))
         Jq = image(np.cross(s.axis, X - s.point))
     G = len(Jg)
-    J = np.stack(Jg, axis=-1)                                 # (N, K, 2, G)
+    J = np.stack(Jg, axis=-1)  # (N, K, 2, G)
     P = G + K
     H, g = np.zeros((P, P)), np.zeros(P)
     wJ = w[..., None, None] * J
@@ -239,10 +240,10 @@ def _normal_equations(s: State, obs: Observations, X, D, r, w):
     g[:G] = np.einsum("nkig,nki->g", wJ, r)
     # q enters twice: + in the observed frame, - in the reference frame (the derivative of the relative angle).
     wJq = w[..., None] * Jq
-    qq = np.sum(wJq * Jq, axis=-1)                            # (N, K)
+    qq = np.sum(wJq * Jq, axis=-1)  # (N, K)
     qr = np.sum(wJq * r, axis=-1)
-    gq = np.einsum("nkig,nki->nkg", wJ, Jq)                   # (N, K, G)
-    lq = np.sum(w[..., None] * Jl * Jq, axis=-1)              # (N, K)
+    gq = np.einsum("nkig,nki->nkg", wJ, Jq)  # (N, K, G)
+    lq = np.sum(w[..., None] * Jl * Jq, axis=-1)  # (N, K)
     own = np.zeros((N, K))
     own[np.arange(N), obs.ref] = 1.0
     H[G:, G:] = np.diag(qq.sum(0)) - qq.T @ own - own.T @ qq + own.T @ (qq.sum(1)[:, None] * own)

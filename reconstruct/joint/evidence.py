@@ -84,7 +84,9 @@ def type_probability(states: dict[str, State], obs: Observations) -> dict[str, f
     log = {}
     effective = max(float(obs.weight[common].sum()), 2.0)
     for n in names:
-        mean = float((obs.weight[common] * costs[n][common]).sum() / (obs.weight[common] @ obs.seen[common].sum(1) + 1e-9))
+        mean = float(
+            (obs.weight[common] * costs[n][common]).sum() / (obs.weight[common] @ obs.seen[common].sum(1) + 1e-9)
+        )
         parameters = 3 if n == "revolute" else 2
         log[n] = -effective * np.log(max(mean, 0.05)) - 0.5 * parameters * np.log(effective)
         if n == "revolute":
@@ -147,8 +149,10 @@ def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | No
             if use.sum() < 8:
                 poses[k] = None
                 continue
-            r0, t0 = poses[k] if poses[k] is not None else _relative_pose(s, base, k)
-            ok, rv, tv = cv2.solvePnP(P[use], obs.xy[use, k], np.eye(3), None, r0.copy(), t0.copy(), True, cv2.SOLVEPNP_ITERATIVE)
+            r0, t0 = poses[k] or _relative_pose(s, base, k)
+            ok, rv, tv = cv2.solvePnP(
+                P[use], obs.xy[use, k], np.eye(3), None, r0.copy(), t0.copy(), True, cv2.SOLVEPNP_ITERATIVE
+            )
             poses[k] = (rv, tv) if ok else None
         P = _triangulate(obs.xy, obs.seen, poses, P)
         free = _free_residuals(P, poses, obs)
@@ -165,8 +169,10 @@ def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | No
     valid = np.isfinite(free)
     score = lambda g: float(np.sum(obs.weight * np.clip(g, 0, None) * np.sqrt((obs.seen & valid).sum(1))))  # noqa: E731
     return FreeMotion(
-        float(np.median(np.sqrt(joint2[both]))), float(np.median(free[both])),
-        score(explained_by(joint2, obs, valid)), score(explained_by(free**2, obs, valid)),
+        float(np.median(np.sqrt(joint2[both]))),
+        float(np.median(free[both])),
+        score(explained_by(joint2, obs, valid)),
+        score(explained_by(free**2, obs, valid)),
     )
 
 
@@ -200,11 +206,10 @@ def _triangulate(xy: np.ndarray, seen: np.ndarray, poses: list, P: np.ndarray) -
             continue
         R, t = cv2.Rodrigues(pose[0])[0], pose[1].ravel()
         for axis in range(2):
-            row = xy[:, k, axis][:, None] * R[2] - R[axis]     # row . X = t_axis - x t_z
+            row = xy[:, k, axis][:, None] * R[2] - R[axis]  # row . X = t_axis - x t_z
             rhs = t[axis] - xy[:, k, axis] * t[2]
             w = seen[:, k] / np.maximum((P @ R[2] + t[2]) ** 2, 1e-6)
             A += w[:, None, None] * row[:, :, None] * row[:, None, :]
             b += (w * rhs)[:, None] * row
     damp = 1e-3 * np.trace(A, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     return np.linalg.solve(A + damp + 1e-9 * np.eye(3), (b + (damp @ P[..., None])[..., 0])[..., None])[..., 0]
-

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.bundle import Observations, State, refine, transport
+from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
 from reconstruct.joint.evidence import free_motion, type_probability
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.select import explained, key_frames, observations, search
@@ -27,8 +27,13 @@ FREE_GAIN = 1.2
 slides, with flexing parts and drifting tracks, lie between 0.9 and 1.1; a lid that is lifted away beyond 1.3."""
 
 
-def fit_joint(video: Video, tracks: Tracks, focal_px: float | None = None, seed: int = 0,
-              progress: Callable[[float], None] | None = None) -> JointFit:
+def fit_joint(
+    video: Video,
+    tracks: Tracks,
+    focal_px: float | None = None,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> JointFit:
     """Joint type, axis, states and the moving link's points from tracks of one static camera.
 
     Args:
@@ -51,7 +56,9 @@ def fit_joint(video: Video, tracks: Tracks, focal_px: float | None = None, seed:
     extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
     moving = np.flatnonzero(extent > MOVING_SHARE * diagonal)
     if len(moving) < MIN_INLIERS:
-        return JointFit("refused", f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place", tracks=len(uv))
+        return JointFit(
+            "refused", f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place", tracks=len(uv)
+        )
     full = focal_px or video.focal_px or DEFAULT_FOCAL * max(video.size)
     focal, centre = full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2])
 
@@ -73,9 +80,8 @@ def fit_joint(video: Video, tracks: Tracks, focal_px: float | None = None, seed:
     # All moving tracks, not just the sample of the search, for the consensus set.
     every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
     s = refine(_redepth(s, every), every, scales=(3.0, 2.0), iterations=8)
-    gain, per = explained(s, every)
-    link = per > 0.5
-    refusal = _why_refused(s, every, link, per)
+    link = explained(s, every)[1] > 0.5
+    refusal = _why_refused(s, every, link)
     if refusal:
         return JointFit("refused", refusal, tracks=len(uv), inliers=int(link.sum()), type_probability=probability)
     tell(0.9)
@@ -94,12 +100,10 @@ def fit_joint(video: Video, tracks: Tracks, focal_px: float | None = None, seed:
 
 
 def _redepth(s: State, obs: Observations) -> State:
-    from reconstruct.joint.bundle import solve_depths
-
     return solve_depths(replace(s, depth=np.ones(len(obs.ref))), obs)
 
 
-def _why_refused(s: State, obs: Observations, link: np.ndarray, per: np.ndarray) -> str | None:
+def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     """A sentence if the best joint is not believable."""
     if link.sum() < MIN_INLIERS:
         return f"no joint: only {int(link.sum())} tracks agree with the best one ({s.kind})"
@@ -113,23 +117,37 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray, per: np.ndarray)
     return None
 
 
-def _all_frames(uv: np.ndarray, focal: float, centre: np.ndarray, keyed: Observations, link: np.ndarray, T: int) -> Observations:
+def _all_frames(
+    uv: np.ndarray, focal: float, centre: np.ndarray, keyed: Observations, link: np.ndarray, T: int
+) -> Observations:
     seen = np.isfinite(uv[..., 0])
     xy = np.where(seen[..., None], (uv - centre) / focal, 0.0)
     ref = keyed.frames[keyed.ref[link]]
     return Observations(xy, seen, ref, keyed.weight[link], 1.0 / focal, np.arange(T))
 
 
-def _result(video: Video, s: State, obs: Observations, members: np.ndarray, full_focal: float,
-            probability: dict[str, float], std: dict, tracks: int) -> JointFit:
+def _result(
+    video: Video,
+    s: State,
+    obs: Observations,
+    members: np.ndarray,
+    full_focal: float,
+    probability: dict[str, float],
+    std: dict,
+    tracks: int,
+) -> JointFit:
     """World frame, signs, units and the contract's fields."""
     X, _ = transport(s, obs)
-    r = np.linalg.norm(np.where(obs.seen[..., None], _residual(X, obs), np.nan), axis=-1)
+    r = np.linalg.norm(np.where(obs.seen[..., None], reprojection(X, obs), np.nan), axis=-1)
     rays = obs.ref_rays
     # Points at q = 0: pull every track's own reference back.
     zero = replace(s, q=np.concatenate([s.q, [0.0]]))
-    extra = replace(obs, xy=np.concatenate([obs.xy, np.zeros((len(rays), 1, 2))], axis=1),
-                    seen=np.concatenate([obs.seen, np.zeros((len(rays), 1), bool)], axis=1), frames=np.arange(len(s.q) + 1))
+    extra = replace(
+        obs,
+        xy=np.concatenate([obs.xy, np.zeros((len(rays), 1, 2))], axis=1),
+        seen=np.concatenate([obs.seen, np.zeros((len(rays), 1), bool)], axis=1),
+        frames=np.arange(len(s.q) + 1),
+    )
     points = transport(zero, extra)[0][:, -1]
     unit = float(np.median(X[..., 2][obs.seen]))
     q, axis = s.q.copy(), s.axis.copy()
@@ -159,18 +177,28 @@ def _result(video: Video, s: State, obs: Observations, members: np.ndarray, full
     std = dict(std, point_m=std["point"] / unit, q=std["q"] / (unit if s.kind == "prismatic" else 1.0))
     std.pop("point")
     fit = JointFit(
-        verdict, reason, s.kind, probability, R @ axis, None if pivot is None else R @ pivot + t, None, q,
-        video.index, K, np.linalg.inv(T_world_camera), points @ R.T + t, members, False, "none", std,
-        residual_px=float(np.nanmedian(r)) / video.scale, inliers=len(members), tracks=tracks,
+        verdict,
+        reason,
+        s.kind,
+        probability,
+        R @ axis,
+        None if pivot is None else R @ pivot + t,
+        None,
+        q,
+        video.index,
+        K,
+        np.linalg.inv(T_world_camera),
+        points @ R.T + t,
+        members,
+        False,
+        "none",
+        std,
+        residual_px=float(np.nanmedian(r)) / video.scale,
+        inliers=len(members),
+        tracks=tracks,
         moving_frames=_moving_frames(q, video.time),
     )
     return replace(fit, image_line=image_line(fit))
-
-
-def _residual(X: np.ndarray, obs: Observations) -> np.ndarray:
-    from reconstruct.joint.bundle import reprojection
-
-    return reprojection(X, obs)
 
 
 def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:

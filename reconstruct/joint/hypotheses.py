@@ -69,9 +69,18 @@ def _smallest_eigenvector_2x2(M: np.ndarray) -> np.ndarray:
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
 
 
-def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarray, weight: np.ndarray, tol: float,
-                        rng: np.random.Generator, directions: int = 160, subsets: int = 40, keep: int = 6,
-                        whole: np.ndarray | None = None) -> list[Hypothesis]:
+def revolute_hypotheses(
+    rays: np.ndarray,
+    frames: np.ndarray,
+    profile: np.ndarray,
+    weight: np.ndarray,
+    tol: float,
+    rng: np.random.Generator,
+    directions: int = 160,
+    subsets: int = 40,
+    keep: int = 6,
+    whole: np.ndarray | None = None,
+) -> list[Hypothesis]:
     """Axis lines from one window.
 
     Args:
@@ -96,17 +105,20 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
     motion2 = np.nanmax(np.sum((rays - rays[:, :1]) ** 2, axis=-1), axis=1)
     found: list[tuple[float, np.ndarray, np.ndarray, float]] = []
     for theta in angles:
-        q = theta * (profile[None] if shared else per_track)[:, 1:]         # (1 or n, m-1)
+        q = theta * (profile[None] if shared else per_track)[:, 1:]  # (1 or n, m-1)
         basis = perpendicular_basis(dirs)
-        y = _rotate(dirs[:, None, None], q[None], x[None, :, :1])           # (d, n, m-1, 3)
+        y = _rotate(dirs[:, None, None], q[None], x[None, :, :1])  # (d, n, m-1, 3)
         A = np.cross(x[None, :, 1:], y)
-        C = np.stack(                                                        # (I - R) basis, (d, 1 or n, m-1, 2, 3)
-            [basis[:, None, None, :, k] - _rotate(dirs[:, None, None], q[None], basis[:, None, None, :, k]) for k in range(2)],
+        C = np.stack(  # (I - R) basis, (d, 1 or n, m-1, 2, 3)
+            [
+                basis[:, None, None, :, k] - _rotate(dirs[:, None, None], q[None], basis[:, None, None, :, k])
+                for k in range(2)
+            ],
             axis=-2,
         )
         B = np.cross(x[None, :, 1:, None, :], C)
         flat = A.reshape(*A.shape[:2], -1)
-        sides = np.moveaxis(B, -2, -1).reshape(*flat.shape, 2)               # (d, n, (m-1) 3, 2)
+        sides = np.moveaxis(B, -2, -1).reshape(*flat.shape, 2)  # (d, n, (m-1) 3, 2)
         AA = np.sum(flat**2, axis=-1) + 1e-12
         AB = (flat[:, :, None] @ sides)[:, :, 0]
         BB = sides.swapaxes(-1, -2) @ sides
@@ -116,7 +128,7 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
         lam = -(c @ AB.swapaxes(-1, -2)) / AA[:, None]
         sign = np.where(np.median(np.sign(lam), axis=-1, keepdims=True) < 0, -1.0, 1.0)
         c, lam = c * sign, lam * sign
-        forms = np.stack([M[..., 0, 0], 2 * M[..., 0, 1], M[..., 1, 1]])     # c' M c as one product
+        forms = np.stack([M[..., 0, 0], 2 * M[..., 0, 1], M[..., 1, 1]])  # c' M c as one product
         squares = np.stack([c[..., 0] ** 2, c[..., 0] * c[..., 1], c[..., 1] ** 2], axis=-1)
         err2 = squares @ np.moveaxis(forms, 0, 1) / np.maximum(seen[:, 1:].sum(1), 1)
         err2 = err2 / np.maximum(lam, 1e-3) ** 2
@@ -129,7 +141,10 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
     found.sort(key=lambda f: -f[0])
     out: list[Hypothesis] = []
     for score, a, c, theta in found:
-        if any(abs(h.axis @ a) > 0.98 and abs(h.point @ c) > 0.97 and np.sign(h.q.sum()) == np.sign((theta * whole).sum()) for h in out):
+        if any(
+            abs(h.axis @ a) > 0.98 and abs(h.point @ c) > 0.97 and np.sign(h.q.sum()) == np.sign((theta * whole).sum())
+            for h in out
+        ):
             continue
         out.append(Hypothesis("revolute", a, c, frames, theta * whole, score))
         if len(out) >= keep:
@@ -137,9 +152,17 @@ def revolute_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarra
     return out
 
 
-def prismatic_hypotheses(rays: np.ndarray, frames: np.ndarray, profile: np.ndarray, weight: np.ndarray, tol: float,
-                         rng: np.random.Generator, directions: int = 600, keep: int = 3,
-                         whole: np.ndarray | None = None) -> list[Hypothesis]:
+def prismatic_hypotheses(
+    rays: np.ndarray,
+    frames: np.ndarray,
+    profile: np.ndarray,
+    weight: np.ndarray,
+    tol: float,
+    rng: np.random.Generator,
+    directions: int = 600,
+    keep: int = 3,
+    whole: np.ndarray | None = None,
+) -> list[Hypothesis]:
     """Slide directions from one window; arguments as for :func:`revolute_hypotheses`.
 
     With a common slide s_t d, |d| = 1, every track's depth follows linearly; depths are relative to the stroke.

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
-def joint_transform(kind: str, axis: np.ndarray, point: np.ndarray | None, q: np.ndarray | float,
-                    pitch: float | None = None) -> np.ndarray:
+def joint_transform(
+    kind: str, axis: np.ndarray, point: np.ndarray | None, q: np.ndarray | float, pitch: float | None = None
+) -> np.ndarray:
     """Pose of the moving link at state q relative to q = 0.
 
     Args:

@@ -24,8 +24,15 @@ def key_frames(uv: np.ndarray, count: int = 28) -> np.ndarray:
     return np.unique(np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, T - 1))
 
 
-def observations(uv_work: np.ndarray, focal_work: float, centre: np.ndarray, frames: np.ndarray, limit: int,
-                 rng: np.random.Generator, diagonal: float) -> tuple[Observations, np.ndarray]:
+def observations(
+    uv_work: np.ndarray,
+    focal_work: float,
+    centre: np.ndarray,
+    frames: np.ndarray,
+    limit: int,
+    rng: np.random.Generator,
+    diagonal: float,
+) -> tuple[Observations, np.ndarray]:
     """Key-frame observations of moving tracks, thinned so that no textured spot dominates.
 
     Returns:
@@ -39,7 +46,9 @@ def observations(uv_work: np.ndarray, focal_work: float, centre: np.ndarray, fra
     middle = np.array([np.flatnonzero(s)[s.sum() // 2] for s in seen])
     place = uv[np.arange(len(ids)), middle]
     # Weight by the reciprocal of the number of neighbours in time and place: area counts, not texture.
-    near = (np.linalg.norm(place[:, None] - place[None], axis=-1) < 0.02 * diagonal) & (np.abs(middle[:, None] - middle[None]) <= 3)
+    near = (np.linalg.norm(place[:, None] - place[None], axis=-1) < 0.02 * diagonal) & (
+        np.abs(middle[:, None] - middle[None]) <= 3
+    )
     weight = 1.0 / np.sqrt(near.sum(1))
     motion = np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1)
     reach = np.linalg.norm(motion, axis=1)
@@ -118,7 +127,7 @@ def _global_hypotheses(obs: Observations, rng: np.random.Generator, rounds: int 
         for row, i in enumerate(ids):
             keys = np.flatnonzero(obs.seen[i])
             keys = keys[np.unique(np.linspace(0, len(keys) - 1, m).round().astype(int))]
-            keys = np.roll(keys, -(len(keys) // 2))            # the middle one is the reference
+            keys = np.roll(keys, -(len(keys) // 2))  # the middle one is the reference
             rays[row, : len(keys)] = np.concatenate([obs.xy[i, keys], np.ones((len(keys), 1))], axis=1)
             local[row, : len(keys)] = profile[keys] - profile[keys[0]]
         args = (rays, np.arange(K), local, obs.weight[ids], 3.0 * obs.px, rng)
@@ -196,7 +205,9 @@ def _restricted(obs: Observations, known: np.ndarray) -> Observations:
     return replace(obs, seen=seen, ref=first)
 
 
-def _search_state(s: State, now: Observations, obs: Observations, use: np.ndarray, t: int, start: float, span: float) -> float:
+def _search_state(
+    s: State, now: Observations, obs: Observations, use: np.ndarray, t: int, start: float, span: float
+) -> float:
     """The state in key frame t by a one-dimensional search over tracks whose depth is known."""
     if use.sum() < 3:
         return float(start)
@@ -207,7 +218,10 @@ def _search_state(s: State, now: Observations, obs: Observations, use: np.ndarra
     cand = Observations(
         np.broadcast_to(obs.xy[sub, t][:, None], (len(sub), 31 + len(s.q), 2)).copy(),
         np.concatenate([np.zeros((len(sub), len(s.q)), bool), np.ones((len(sub), 31), bool)], axis=1),
-        now.ref[sub], obs.weight[sub], obs.px, np.arange(31 + len(s.q)),
+        now.ref[sub],
+        obs.weight[sub],
+        obs.px,
+        np.arange(31 + len(s.q)),
     )
     cand.xy[np.arange(len(sub)), now.ref[sub]] = rays[:, :2]
     trial = replace(s, q=np.concatenate([s.q, grid]), depth=s.depth[sub])
@@ -215,7 +229,7 @@ def _search_state(s: State, now: Observations, obs: Observations, use: np.ndarra
     r2 = np.sum(reprojection(X, cand)[:, len(s.q) :] ** 2, axis=-1)
     cost = np.sum(obs.weight[sub][:, None] * np.minimum(r2, (3 * SCORE_PX) ** 2), axis=0)
     k = int(np.argmin(cost))
-    if 0 < k < 30:                                            # parabola through the minimum
+    if 0 < k < 30:  # parabola through the minimum
         a, b, c = cost[k - 1 : k + 2]
         shift = 0.5 * (a - c) / (a - 2 * b + c + 1e-12)
         return float(grid[k] + np.clip(shift, -1, 1) * (grid[1] - grid[0]))
@@ -248,8 +262,13 @@ def explained_by(r2: np.ndarray, obs: Observations, valid: np.ndarray, scale: fl
     return gain.sum(1) / np.maximum(counted.sum(1) - 1, 1)
 
 
-def search(obs: Observations, rng: np.random.Generator, coarse: int = 60, fine: int = 10,
-           progress: Callable[[float], None] = lambda _: None) -> list[State]:
+def search(
+    obs: Observations,
+    rng: np.random.Generator,
+    coarse: int = 60,
+    fine: int = 10,
+    progress: Callable[[float], None] = lambda _: None,
+) -> list[State]:
     """Best joints of both types, best first."""
     hyps = window_hypotheses(obs, rng)
     progress(0.4)
@@ -293,9 +312,14 @@ def _tilted_back(s: State, obs: Observations) -> State:
 def _distinct(states: list[State], count: int) -> list[State]:
     out: list[State] = []
     for s in states:
-        same = lambda o: abs(o.axis @ s.axis) > 0.995 and (s.kind == "prismatic" or o.point @ s.point > 0.995)  # noqa: E731
-        if not any(same(o) for o in out):
+        if not any(_same(s, o) for o in out):
             out.append(s)
         if len(out) >= count:
             break
     return out
+
+
+def _same(one: State, other: State) -> bool:
+    """Nearly the same axis line."""
+    turned = abs(one.axis @ other.axis) < 0.995
+    return not turned and (one.kind == "prismatic" or one.point @ other.point > 0.995)

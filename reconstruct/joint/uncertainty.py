@@ -6,7 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.joint.bundle import Observations, State, _normal_equations, refine, reprojection, robust_cost, transport
+from reconstruct.joint.bundle import (
+    Observations,
+    State,
+    normal_equations,
+    refine,
+    reprojection,
+    robust_cost,
+    transport,
+)
 
 TEMPORAL_CORRELATION = 10.0
 """Frames over which a track's error stays the same (drift): that many observations count as one."""
@@ -21,14 +29,17 @@ def joint_std(s: State, obs: Observations, focal_std: float, scale: float = 2.0)
     X, D = transport(s, obs)
     r = reprojection(X, obs)
     _, w = robust_cost(r, obs, scale)
-    H, _, Hll, Hgl, _ = _normal_equations(s, obs, X, D, r, w)
+    H, _, Hll, Hgl, _ = normal_equations(s, obs, X, D, r, w)
     S = H - (Hgl / (Hll + 1e-12)) @ Hgl.T
     K = len(s.q)
     G = len(S) - K
     noise2 = float(np.sum(w * np.sum(r**2, axis=-1)) / (2 * w.sum() + 1e-12)) * TEMPORAL_CORRELATION
     # q[0] is the gauge; the smoothness prior keeps states that nothing observes finite.
     S[G, G] += 1e6 * np.trace(S) / len(S)
-    cov = np.linalg.pinv(S + 1e-9 * np.trace(S) / len(S) * np.eye(len(S)), hermitian=True) * noise2 * np.median(w[w > 0]) if (w > 0).any() else np.eye(len(S))
+    if not (w > 0).any():
+        return {"axis_deg": 90.0, "point": 1.0, "q": np.full(K, np.ptp(s.q))}
+    damped = S + 1e-9 * np.trace(S) / len(S) * np.eye(len(S))
+    cov = np.linalg.pinv(damped, hermitian=True) * noise2 * np.median(w[w > 0])
     axis_var = float(np.trace(cov[:2, :2]))
     point_var = float(cov[2, 2]) if G > 2 else 0.0
     q_var = np.clip(np.diag(cov)[G:], 0, np.ptp(s.q) ** 2)

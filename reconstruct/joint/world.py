@@ -29,7 +29,10 @@ def assumed_up(kind: str, axis: np.ndarray, points_start: np.ndarray, points_end
         return axis * np.sign(axis @ prior), "the joint axis is taken as vertical"
     level = prior - (prior @ axis) * axis
     level /= np.linalg.norm(level)
-    best, how = level, f"the joint axis is taken as horizontal, the camera as looking down by {np.degrees(TYPICAL_PITCH):.0f} deg"
+    best, how = (
+        level,
+        f"the joint axis is taken as horizontal, the camera as looking down by {np.degrees(TYPICAL_PITCH):.0f} deg",
+    )
     nearest = np.cos(np.radians(25.0))
     if kind != "prismatic":
         for points, when in ((points_start, "first"), (points_end, "last")):

@@ -58,8 +58,13 @@ def change_region(video: Video, dilate: int = 9) -> np.ndarray:
     return cv2.dilate(region, np.ones((2 * dilate + 1,) * 2, np.uint8)) > 0
 
 
-def track_points(video: Video, hands: Hands | None = None, references: np.ndarray | None = None,
-                 per_reference: int = 220, progress: Callable[[float], None] | None = None) -> Tracks:
+def track_points(
+    video: Video,
+    hands: Hands | None = None,
+    references: np.ndarray | None = None,
+    per_reference: int = 220,
+    progress: Callable[[float], None] | None = None,
+) -> Tracks:
     """Seed and follow corners.
 
     Args:
@@ -99,7 +104,9 @@ def track_points(video: Video, hands: Hands | None = None, references: np.ndarra
         if progress:
             progress(done / 2)
     visible = np.isfinite(uv[..., 0])
-    return Tracks(video.to_full(uv).astype(np.float32), visible, reference, ProviderInfo("lk", cv2.__version__, "Apache-2.0"))
+    return Tracks(
+        video.to_full(uv).astype(np.float32), visible, reference, ProviderInfo("lk", cv2.__version__, "Apache-2.0")
+    )
 
 
 def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
@@ -128,8 +135,9 @@ def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
     return p
 
 
-def _follow(grey: list[np.ndarray], order: list[int], uv: np.ndarray, reference: np.ndarray,
-            covered: np.ndarray | None) -> None:
+def _follow(
+    grey: list[np.ndarray], order: list[int], uv: np.ndarray, reference: np.ndarray, covered: np.ndarray | None
+) -> None:
     """Extend all tracks along `order` (in place); each starts when its reference frame comes up."""
     import cv2
 
@@ -163,8 +171,12 @@ def _follow(grey: list[np.ndarray], order: list[int], uv: np.ndarray, reference:
                 continue
             sel = np.flatnonzero(anchor[ids] == a)
             pa = uv[ids[sel], a].reshape(-1, 1, 2)
-            m, ok, _ = cv2.calcOpticalFlowPyrLK(grey[a], grey[t], pa, n[sel].reshape(-1, 1, 2).copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags)
-            c, ok2, _ = cv2.calcOpticalFlowPyrLK(grey[t], grey[a], m, pa.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags)
+            m, ok, _ = cv2.calcOpticalFlowPyrLK(
+                grey[a], grey[t], pa, n[sel].reshape(-1, 1, 2).copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags
+            )
+            c, ok2, _ = cv2.calcOpticalFlowPyrLK(
+                grey[t], grey[a], m, pa.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags
+            )
             m = m.reshape(-1, 2)
             fine = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(c - pa, axis=-1).ravel() < 0.5)
             fine &= np.linalg.norm(m - n[sel], axis=-1) < ANCHOR_PX

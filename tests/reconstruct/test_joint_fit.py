@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from tests.reconstruct.joint_scenes import H, W, make_scene, make_video
 
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.fit import fit_joint
+from tests.reconstruct.joint_scenes import H, W, make_scene, make_video
 
 SLAB = [[-0.3, 0.3], [-0.4, 0.0], [-0.02, 0.02]]
 SCENES = {

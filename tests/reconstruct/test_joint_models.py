@@ -7,7 +7,11 @@ from hypothesis import strategies as st
 
 from reconstruct.joint.models import JointFit, joint_transform
 
-unit = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1).map(lambda v: np.array(v) / np.linalg.norm(v))
+unit = (
+    st.tuples(*[st.floats(-1, 1)] * 3)
+    .filter(lambda v: np.linalg.norm(v) > 0.1)
+    .map(lambda v: np.array(v) / np.linalg.norm(v))
+)
 place = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
 state = st.floats(-3, 3)
 
@@ -35,7 +39,9 @@ def test_unknown_type_lists_the_known_ones():
 
 
 def test_states_broadcast_and_projection_uses_camera():
-    fit = JointFit("ok", "", "prismatic", axis=np.array([1.0, 0, 0]), K=np.diag([100.0, 100, 1]), T_camera_world=np.eye(4))
+    fit = JointFit(
+        "ok", "", "prismatic", axis=np.array([1.0, 0, 0]), K=np.diag([100.0, 100, 1]), T_camera_world=np.eye(4)
+    )
     assert fit.link_pose(np.zeros((5, 2))).shape == (5, 2, 4, 4)
     np.testing.assert_allclose(fit.project(np.array([[1.0, 2.0, 4.0]])), [[25.0, 50.0]])
     assert fit.unit == "m"

@@ -2,10 +2,10 @@
 
 import cv2
 import numpy as np
-from tests.reconstruct.joint_scenes import make_video
 
 from reconstruct.cues import Hands, ProviderInfo
 from reconstruct.providers.lk_tracks import change_region, reference_frames, track_points
+from tests.reconstruct.joint_scenes import make_video
 from tests.reconstruct.textures import turning_plate
 
 
@@ -33,7 +33,10 @@ def test_tracks_follow_the_plate_and_stay_off_hands():
     assert not mask[t, v, u].any()
     # Seeds come from several frames and are followed both ways.
     assert len(set(tracks.reference)) > 5
-    both = [(tracks.visible[i, : tracks.reference[i]].any() and tracks.visible[i, tracks.reference[i] + 1 :].any()) for i in moving]
+    both = [
+        (tracks.visible[i, : tracks.reference[i]].any() and tracks.visible[i, tracks.reference[i] + 1 :].any())
+        for i in moving
+    ]
     assert np.mean(both) > 0.3
 
 

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-from tests.reconstruct.joint_scenes import make_video
 
 from reconstruct.errors import TaaError
 from reconstruct.motion import estimate_camera_motion, stabilise
+from tests.reconstruct.joint_scenes import make_video
 
 
 def texture(seed=0, size=(360, 480)):
@@ -25,8 +25,10 @@ def as_video(frames, folder):
 def test_static_camera_is_left_alone(tmp_path):
     rng = np.random.default_rng(0)
     base = texture()
-    frames = np.stack([np.clip(base + rng.normal(scale=2, size=base.shape), 0, 255).astype(np.uint8) for _ in range(12)])
-    frames[6:, 100:200, 150:300] = 90                      # something large moves in front
+    frames = np.stack(
+        [np.clip(base + rng.normal(scale=2, size=base.shape), 0, 255).astype(np.uint8) for _ in range(12)]
+    )
+    frames[6:, 100:200, 150:300] = 90  # something large moves in front
     video = as_video(frames, tmp_path)
     same, motion = stabilise(video)
     assert motion.static
