@@ -251,6 +251,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     from reconstruct.depth import depth_scale
     from reconstruct.hand.scale import hand_scale
     from reconstruct.joint.fit import fit_joint
+    from reconstruct.others import second_part
 
     notes: list[str] = []
     if focal is None and camera is not None:
@@ -279,6 +280,8 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         notes.append("cues/depth.npz gives no scale: it is not metric or hardly meets the part's points")
     if camera is not None and "T_world_camera" in camera:
         fit = cues_io.in_world_of(fit, camera)
+    if words := second_part(video, tracks, fit):
+        notes.append(words)
     return fit, notes
 
 

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import json
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -217,6 +218,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         args=argv,
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
     )
+    with contextlib.suppress(ValueError):  # only the main thread may; a batch system's end is then as orderly as Ctrl-C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     data: dict | None = None
     code = 0
     # A process that ends after this command keeps its stdout redirected: libraries may print while they unload.
