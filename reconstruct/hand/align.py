@@ -15,7 +15,7 @@ import numpy as np
 from reconstruct.cues import HandReference, Hands, LinkMasks
 from reconstruct.geometry import Geometry
 from reconstruct.hand.drive import Drive, close_gaps, find_drive, moving_frames, runs
-from reconstruct.hand.grip import RADII, SPHERES, Grip, find_grips
+from reconstruct.hand.grip import RADII, Grip, find_grips
 from reconstruct.hand.path import clear_path, exit_direction
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.shape import LinkShape
@@ -272,4 +272,4 @@ def _absent(video: Video, fit: JointFit, shape: LinkShape, note: str) -> HandRef
                          nobody.copy(), "right", (note,))
 
 
-__all__ = ["align_hand", "depth_factor", "observe", "rest_pose", "SPHERES"]
+__all__ = ["align_hand", "depth_factor", "observe", "rest_pose"]

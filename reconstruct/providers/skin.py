@@ -166,9 +166,9 @@ def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
         seed = np.zeros(shape, np.uint8)
         for uv in hands[t]:
             seed |= _draw_hand(shape, uv, 0.2)
-        allowed = (loose & ((near[t] | arm[t]) > 0)) | (solid & (arm[t] > 0))
-        allowed = cv2.morphologyEx(allowed.astype(np.uint8), cv2.MORPH_OPEN, kernel)
-        allowed |= cv2.morphologyEx(allowed, cv2.MORPH_CLOSE, bridge) & (arm[t] > 0)
+        agreed = (loose & ((near[t] | arm[t]) > 0)) | (solid & (arm[t] > 0))
+        allowed = cv2.morphologyEx(agreed.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+        allowed = np.maximum(allowed, cv2.morphologyEx(allowed, cv2.MORPH_CLOSE, bridge) & arm[t])
         mask = _connected(allowed | seed, seed).astype(np.uint8)
         masks[t] = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)
     _carry_on(masks, hands, candidates, video.time, kernel)
