@@ -10,15 +10,13 @@ import numpy as np
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
 from reconstruct.joint.evidence import free_motion, type_probability
+from reconstruct.joint.focal import DEFAULT_FOCAL, estimate_focal
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.select import explained, key_frames, observations, search
 from reconstruct.joint.uncertainty import joint_std
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 
-DEFAULT_FOCAL = 0.8
-"""Focal length over the image's long side where nothing is known (phones: 0.7 to 0.85)."""
-FOCAL_STD = 0.12
 MOVING_SHARE = 0.012
 """A track moves if its extent exceeds this share of the image diagonal."""
 MIN_INLIERS = 8
@@ -59,7 +57,8 @@ def fit_joint(
         return JointFit(
             "refused", f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place", tracks=len(uv)
         )
-    full = focal_px or video.focal_px or DEFAULT_FOCAL * max(video.size)
+    known = focal_px or video.focal_px
+    full, focal_std = known or DEFAULT_FOCAL * max(video.size), 0.02
     focal, centre = full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2])
 
     keys = key_frames(uv[moving])
@@ -88,13 +87,18 @@ def fit_joint(
 
     # Directions that the data hardly hold (an axis towards the camera) converge slowly: finish on the link alone.
     own = Observations(every.xy[link], every.seen[link], every.ref[link], every.weight[link], every.px, every.frames)
-    s = refine(replace(s, depth=s.depth[link]), own, scales=(2.0,), iterations=60)
+    s = replace(s, depth=s.depth[link])
+    if not known:
+        factor, focal_std = estimate_focal(s, own)
+        full, focal = full * factor, focal * factor
+        own = replace(own, xy=own.xy / factor, px=own.px / factor)
+    s = refine(s, own, scales=(4.0, 2.0), iterations=60)
     members = moving[ids[link]]
     T = len(video)
     dense = _all_frames(uv[members], focal, centre, every, link, T)
     s = replace(s, q=np.interp(np.arange(T), keys, s.q))
     s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
-    std = joint_std(s, dense, focal_std=FOCAL_STD if not (focal_px or video.focal_px) else 0.02)
+    std = joint_std(s, dense, focal_std)
     tell(1.0)
     return _result(video, s, dense, members, full, probability, std, len(uv))
 

@@ -1,0 +1,74 @@
+"""The whole chain on whole videos: rendered ones always, real ones where they are present."""
+
+import numpy as np
+import pytest
+
+from benchmarks.clips import annotations, run
+
+pytestmark = pytest.mark.slow
+PRESENT = annotations()
+
+
+def real(name):
+    return pytest.param(
+        name, marks=pytest.mark.skipif(name not in PRESENT, reason=f"shared/data/videos/{name} is absent")
+    )
+
+
+@pytest.mark.parametrize(
+    "name", [real(n) for n in ("treasurebox01.avi", "stapler_fold.mp4", "dishwasher.mp4", "suitcase.mp4")]
+)
+def test_real_clip_gives_the_annotated_joint_and_a_replay(name, tmp_path):
+    truth, row = PRESENT[name], run(name, tmp_path)
+    assert row["verdict"] == "ok", row
+    assert row["type"] == truth["joint"]
+    assert row.get("angle_deg", 0) < 8
+    assert row.get("distance", 0) < 0.04
+    if "range_deg" in truth:
+        assert truth["range_deg"][0] <= row["range"] <= truth["range_deg"][1]
+    assert row["replay"]["joint_progress"] >= 0.7
+    assert max(row["replay"]["controls"].values()) < 0.1
+
+
+@pytest.mark.parametrize("name", [real("kitchen_pot.mp4")])
+def test_a_lid_that_is_lifted_away_is_refused(name, tmp_path):
+    row = run(name, tmp_path)
+    assert row["verdict"] == "refused"
+    assert "free body" in row["reason"] or "no joint" in row["reason"]
+    assert row["asset"] is None
+
+
+@pytest.mark.parametrize("name", [real("microwave.mp4")])
+def test_a_door_that_springs_open_is_not_driven_by_contact(name, tmp_path):
+    row = run(name, tmp_path)
+    assert row["type"] == "revolute"
+    assert row["angle_deg"] < 8 and row["distance"] < 0.04
+    assert row["replay"]["joint_progress"] < 0.1
+    assert row["replay"]["contact_fraction"] == 0
+
+
+def test_demo_clip_from_its_pixels_alone(tmp_path):
+    row = run("demo", tmp_path)
+    assert (row["verdict"], row["type"]) == ("ok", "revolute")
+    assert row["angle_deg"] < 2
+    assert row["distance"] < 0.02
+    assert row["replay"]["joint_progress"] >= 0.9
+    assert max(row["replay"]["controls"].values()) < 0.1
+    # The same asset as a user gets it.
+    import gymnasium
+
+    from taa_envs.registry import register_assets
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TAA_ASSETS", str(tmp_path / "assets"))
+        register_assets()
+        env = gymnasium.make("TAA/clip-demo")
+        observation, info = env.reset(seed=0)
+        assert np.isfinite(observation).all()
+        env.close()
+
+
+def test_rendered_negatives_are_refused(tmp_path):
+    for name in ("lift", "still"):
+        row = run(name, tmp_path)
+        assert row["verdict"] == "refused", row
