@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, transport
-from reconstruct.joint.select import SCORE_PX, explained, explained_by
+from reconstruct.joint.select import SCORE_PX, explained, explained_by, total_explained
 
 
 def held_out_costs(s: State, obs: Observations, fold: int = 3, scale: float = SCORE_PX) -> np.ndarray:
@@ -156,8 +156,7 @@ def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | No
             poses[k] = (rv, tv) if ok else None
         P = _triangulate(obs.xy, obs.seen, poses, P)
         free = _free_residuals(P, poses, obs)
-        gain = explained_by(free**2, obs, np.isfinite(free))
-        members = gain > 0.5
+        members = explained_by(free**2, obs, np.isfinite(free))[0] > 0.5
         if members.sum() < 8:
             return None
     both = obs.seen & np.isfinite(free) & link[:, None] & members[:, None]
@@ -167,12 +166,12 @@ def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | No
         return None
     joint2 = np.sum(reprojection(X, obs) ** 2, axis=-1)
     valid = np.isfinite(free)
-    score = lambda g: float(np.sum(obs.weight * np.clip(g, 0, None) * np.sqrt((obs.seen & valid).sum(1))))  # noqa: E731
+    score = lambda e2: total_explained(*explained_by(e2, obs, valid), obs)  # noqa: E731
     return FreeMotion(
         float(np.median(np.sqrt(joint2[both]))),
         float(np.median(free[both])),
-        score(explained_by(joint2, obs, valid)),
-        score(explained_by(free**2, obs, valid)),
+        score(joint2),
+        score(free**2),
     )
 
 

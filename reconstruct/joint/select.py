@@ -239,27 +239,40 @@ def _search_state(
 def explained(s: State, obs: Observations, scale: float = SCORE_PX) -> tuple[float, np.ndarray]:
     """Explained motion: how much better than "static" the joint explains all tracks.
 
-    Each observation contributes rho(displacement) - rho(residual) with rho truncated, so a point that
-    hardly moves can contribute hardly anything, and one that is not explained nothing.
-
     Returns:
-        (sum over tracks, (N,) mean contribution of each track in [−1, 1]).
+        (sum over tracks, (N,) explained share of each track's motion, at most 1, negative where "static" is better).
     """
     X, _ = transport(s, obs)
-    per = explained_by(np.sum(reprojection(X, obs) ** 2, axis=-1), obs, obs.seen, scale)
+    share, amount = explained_by(np.sum(reprojection(X, obs) ** 2, axis=-1), obs, obs.seen, scale)
     sane = (s.depth > 0.1 * np.median(s.depth)) & (s.depth < 10 * np.median(s.depth))
-    per = np.where(sane, per, 0)
-    return float(np.sum(obs.weight * np.clip(per, 0, None) * np.sqrt(obs.seen.sum(1)))), per
+    share = np.where(sane, share, 0)
+    return total_explained(share, amount, obs), share
 
 
-def explained_by(r2: np.ndarray, obs: Observations, valid: np.ndarray, scale: float = SCORE_PX) -> np.ndarray:
-    """(N,) mean contribution of each track for squared residuals r2 (N, K), px^2, counted where valid."""
+def total_explained(share: np.ndarray, amount: np.ndarray, obs: Observations) -> float:
+    """Sum over tracks; the square root because a track's frames err together."""
+    return float(np.sum(obs.weight * np.clip(share, 0, None) * np.sqrt(amount)))
+
+
+def explained_by(
+    r2: np.ndarray, obs: Observations, valid: np.ndarray, scale: float = SCORE_PX
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each track's motion that squared residuals r2 (N, K), px^2, leave explained where valid.
+
+    Each observation has rho(displacement) to explain, with rho truncated, and is left with rho(residual): a point
+    that hardly moves has hardly anything to explain, and counts against the model if that moves it. The time for
+    which a track rests does not count.
+
+    Returns:
+        (N,) share in (-inf, 1], and (N,) amount of motion, about the number of frames in which the track is away.
+    """
     own = obs.xy[np.arange(len(obs.ref)), obs.ref][:, None]
     moved2 = np.sum(((obs.xy - own) / obs.px) ** 2, axis=-1)
     rho = lambda e2: 1 - 1 / (1 + e2 / scale**2)  # noqa: E731
     counted = obs.seen & valid
-    gain = np.where(counted, rho(moved2) - rho(np.where(counted, r2, 0)), 0)
-    return gain.sum(1) / np.maximum(counted.sum(1) - 1, 1)
+    amount = np.where(counted, rho(moved2), 0).sum(1)
+    left = np.where(counted, rho(np.where(counted, r2, 0)), 0).sum(1)
+    return (amount - left) / np.maximum(amount, 1.0), amount
 
 
 def search(
