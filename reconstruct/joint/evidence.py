@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, transport
-from reconstruct.joint.select import SCORE_PX, explained, explained_by, total_explained
+from reconstruct.joint.select import SCORE_PX, explained, explained_by
 
 
 def held_out_costs(s: State, obs: Observations, fold: int = 3, scale: float = SCORE_PX) -> np.ndarray:
@@ -112,14 +112,13 @@ class FreeMotion:
     """The joint against the same body moving freely.
 
     Attributes:
-        joint_px, free_px: median residuals of the link's tracks, working px.
-        joint_gain, free_gain: explained motion (as in ``explained``) of all tracks by either.
+        joint_px, free_px: median residuals, working px, of the body's tracks that move most.
+        unexplained: share of these tracks that follow the free body but not the joint.
     """
 
     joint_px: float
     free_px: float
-    joint_gain: float
-    free_gain: float
+    unexplained: float
 
 
 def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | None:
@@ -135,8 +134,7 @@ def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | No
 
     K = obs.seen.shape[1]
     X, _ = transport(s, obs)
-    joint_gain, per = explained(s, obs)
-    link = per > 0.5
+    link = explained(s, obs)[1] > 0.5
     if link.sum() < 8:
         return None
     base = int(np.argmax(obs.seen[link].sum(0)))
@@ -159,19 +157,18 @@ def free_motion(s: State, obs: Observations, rounds: int = 8) -> FreeMotion | No
         members = explained_by(free**2, obs, np.isfinite(free))[0] > 0.5
         if members.sum() < 8:
             return None
-    both = obs.seen & np.isfinite(free) & link[:, None] & members[:, None]
-    # Frames near the base state say nothing: everything fits there.
-    both &= (np.abs(s.q - s.q[base]) > 0.15 * np.ptp(s.q))[None]
-    if both.sum() < 30:
+    valid = obs.seen & np.isfinite(free)
+    if valid[members].sum() < 30:
         return None
+    # What moves little follows any motion: the half that moves most decides.
+    seen_xy = np.where(obs.seen[..., None], obs.xy, np.nan)
+    extent = np.linalg.norm(np.nanmax(seen_xy, axis=1) - np.nanmin(seen_xy, axis=1), axis=-1)
+    far = members & (extent >= np.median(extent[members]))
     joint2 = np.sum(reprojection(X, obs) ** 2, axis=-1)
-    valid = np.isfinite(free)
-    score = lambda e2: total_explained(*explained_by(e2, obs, valid), obs)  # noqa: E731
     return FreeMotion(
-        float(np.median(np.sqrt(joint2[both]))),
-        float(np.median(free[both])),
-        score(joint2),
-        score(free**2),
+        float(np.median(np.sqrt(joint2[far][valid[far]]))),
+        float(np.median(free[far][valid[far]])),
+        float(np.mean(~link[far])),
     )
 
 
