@@ -13,43 +13,64 @@ from gymnasium.utils import EzPickle
 
 from taa_envs.asset import Asset
 from taa_envs.registry import CONTROL_PERIOD, get_asset
-from taa_envs.reward import RewardInputs, reward_scales, reward_terms
-from taa_envs.scene import TIMESTEP, build_scene
-from taa_envs.simulation import Diverged, HandPath, Simulation, Step
+from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, goal_reward
+from taa_envs.rows import SingleRows
+from taa_envs.scene import build_scene
+from taa_envs.task import OBSERVATIONS, RESIDUALS, Task, apply_residual
 
-SUCCESS_PROGRESS = 0.95
-DRIVEN_SHARE = 0.8  # of the progress made, what contact must have driven for a success
-TRANSLATION, ROTATION, CLOSURE = 0.03, 0.3, 0.5  # m, rad, share of the way: residuals of an action of 1
-ACTIONS = 7
-PALM = (0, 5, 9, 13, 17)
-TIPS = (4, 8, 12, 16, 20)
-# How far along its finger each landmark is: closing moves tips all the way, knuckles not at all.
-CURL = np.array([0, 0, 1, 2, 3] + [0, 1, 2, 3] * 4) / 3.0
-RANDOMIZE = {"hand": 0.01, "damping": 0.3, "frictionloss": 0.3, "friction": 0.2}
-RESET_OPTIONS = ("q0", "phase", "randomize")
+ACTIONS = RESIDUALS  # numbers in an action of the default kind
 
 
-def apply_residual(joints: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """Landmarks (21, 3) m, moved, turned about the palm and closed by an action (7,)."""
-    moved = joints + (CLOSURE * action[6] * CURL)[:, None] * (joints[list(TIPS)].mean(0) - joints)
-    rotvec = ROTATION * np.asarray(action[3:6], float)
-    angle = float(np.linalg.norm(rotvec))
-    if angle > 1e-12:
-        palm, k = joints[list(PALM)].mean(0), rotvec / angle
-        arm = moved - palm
-        moved = (palm + arm * np.cos(angle) + np.cross(k, arm) * np.sin(angle)
-                 + np.outer(arm @ k, k) * (1 - np.cos(angle)))
-    return moved + TRANSLATION * np.asarray(action[:3], float)
+def spaces_of(task: Task, observation: str) -> tuple[spaces.Space, spaces.Box]:
+    """Observation and action space of a task.
+
+    Raises:
+        ValueError: unknown kind of observation.
+    """
+    if observation not in OBSERVATIONS:
+        raise ValueError(f"no observation is named {observation!r}; known: {', '.join(OBSERVATIONS)}")
+    if task.goal and observation == "dict":
+        raise ValueError("reward='sparse_goal' observes {observation, achieved_goal, desired_goal}; "
+                         "leave observation='flat'")
+
+    def box(size: int) -> spaces.Box:
+        return spaces.Box(-10.0, 10.0, (size,), np.float32)
+
+    flat: spaces.Space = box(sum(task.observation_parts.values()))
+    if task.goal:
+        flat = spaces.Dict({"observation": flat, "achieved_goal": box(2), "desired_goal": box(2)})
+    elif observation == "dict":
+        flat = spaces.Dict({name: box(size) for name, size in task.observation_parts.items()})
+    return flat, spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
+
+
+def observe(task: Task, observation: str) -> np.ndarray | dict[str, np.ndarray]:
+    """(n, ...) observations in the form of :func:`spaces_of`; new arrays."""
+    parts = task.observation()
+    if observation == "dict":
+        return parts
+    flat = np.concatenate(list(parts.values()), axis=1)
+    if not task.goal:
+        return flat
+    return {"observation": flat, "achieved_goal": task.achieved(),
+            "desired_goal": np.tile(np.array(GOAL, np.float32), (task.n, 1))}
+
+
+def compute_reward(achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray | float:
+    """Rewards (...) of goals (..., 2), see :func:`taa_envs.reward.goal_reward`; info is not looked at."""
+    reward = goal_reward(achieved_goal, desired_goal)
+    return reward if reward.ndim else float(reward)
 
 
 class ArticulationEnv(gymnasium.Env, EzPickle):
     """Drive an articulated object's joint through contact, as the hand in a video did.
 
     The object's joint is passive: no actuator, no equality, and no write to its state during an episode. What moves it
-    is the hand, whose targets are the demonstrated landmarks plus a residual. The zero action is the open-loop replay.
+    is the hand, whose position actuators the action aims.
 
     ## Actions
-    ``Box(-1, 1, (7,), float32)``, a residual on the reference hand at the current time:
+    ``action="residual"`` (default): ``Box(-1, 1, (7,), float32)``, added to the reference hand at the current time. The
+    zero action is the open-loop replay of the demonstration.
 
     | index | what | of an action of 1 |
     | --- | --- | --- |
@@ -57,23 +78,36 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     | 3-5 | rotation about x, y, z through the palm's centre | 0.3 rad |
     | 6 | closing: finger joints move towards the finger tips' mean (negative: open) | 0.5 of the way at the tips |
 
-    ## Observations
-    ``Box(-10, 10, (138,), float32)``, clipped:
+    ``action="absolute"``: ``Box(-1, 1, (63,), float32)``, where the 21 landmarks are to be, relative to the
+    demonstration's first frame, in units of ``reach`` (1.25 times the farthest the demonstrated hand goes along an
+    axis, at least 0.1 m). The zero action holds the hand where the demonstration began. Targets move at most at 2 m/s (or 1.5
+    times the demonstration's fastest). :meth:`reference_action` is the action that follows the demonstration.
 
-    | index | what |
-    | --- | --- |
-    | 0 | joint: fraction of the demonstrated stroke, not clipped to [0, 1] |
-    | 1 | its rate in strokes per demonstration |
-    | 2 | time, as a fraction of the demonstration, at most 1 |
-    | 3 | the demonstration's stroke fraction at this time |
-    | 4 | 1 while the hand pushes on the moving link |
-    | 5-67 | 21 landmarks where they are, from the object's centre, in units of its size |
-    | 68-130 | 21 landmarks, from where they are to the reference, in units of 0.02 m |
-    | 131-137 | the last action |
+    ## Observations
+    ``observation="flat"`` (default): ``Box(-10, 10, (153,), float32)`` (209 with absolute actions), clipped;
+    ``observation="dict"``: the same parts as a Dict of boxes.
+
+    | part | index | what |
+    | --- | --- | --- |
+    | joint | 0 | fraction of the demonstrated stroke, not clipped to [0, 1] |
+    | | 1 | its rate in strokes per demonstration |
+    | hand | 2-64 | 21 landmarks where they are, from the object's centre, in units of its size |
+    | | 65-67 | their mean velocity, m/s |
+    | contact | 68 | 1 if the hand pushed on the moving link in the last step |
+    | | 69-71 | mean contact force of that step on the link, asset frame, in units of 10 N |
+    | | 72 | its moment about the joint, in 10 N at the object's size (10 N along a slide) |
+    | reference | 73 | time as a fraction of the demonstration, at most 1 |
+    | | 74 | the demonstration's stroke fraction now |
+    | | 75-137 | 21 landmarks, from where they are to the reference, in units of 0.02 m |
+    | | 138-139 | the demonstration's stroke fraction in 0.1 and in 0.3 s |
+    | | 140-145 | the demonstrated hand's way from now to then, in units of the object's size |
+    | action | 146- | the last action |
 
     ## Rewards
     ``reward="dense"`` (default), ``"sparse"`` (1 on success) or a dict of scales of the terms in
-    :mod:`taa_envs.reward`.
+    :mod:`taa_envs.reward`. ``reward="sparse_goal"`` makes the task goal-conditioned: observations are a Dict of
+    ``observation`` (flat), ``achieved_goal`` and ``desired_goal``, the fraction of the stroke and the share of it that
+    contact drove, and the reward is ``compute_reward(achieved_goal, desired_goal, info)``, 0 at the goal, else -1.
 
     ## Episode
     Starts at the demonstration's first frame. Terminates on success: ``joint_progress >= 0.95``, of which at least 0.8
@@ -85,16 +119,18 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     - ``q0``: joint state to start from, within its range, rad or m.
     - ``phase``: in [0, 1], start at this fraction of the demonstration; the joint starts where the demonstration had
       it, unless q0 says otherwise.
-    - ``randomize``: True, or a dict with any of ``hand`` (m, std of an offset of the whole hand), ``damping``,
-      ``frictionloss``, ``friction`` (relative, uniform); drawn from the environment's seeded generator.
+    - ``randomize``: True draws axis, pivot, scale, mass, damping, friction and the hand's place from the asset's own
+      uncertainties (:mod:`taa_envs.randomize`); a list of names draws those; a dict of names gives the standard
+      deviations. What was drawn is in ``info["randomized"]``. The default is the argument ``randomize``.
 
     ## Info
-    ``joint_progress``, ``final_q_error``, ``is_success``, ``contact``, ``contact_fraction``, ``reward_terms``.
+    ``joint_progress``, ``final_q_error``, ``is_success`` (was one at some time of the episode), ``success_now``,
+    ``contact``, ``contact_fraction``, ``diverged``, ``reward_terms``; after a reset ``randomized``.
 
     ## Arguments
-    asset: an id, a folder or an :class:`Asset`.  hand: name of a hand.  reward: see above.  render_mode: None,
-    "rgb_array" or "depth_array".  camera: "video" (where the asset knows it) or "overview".  width, height: px.
-    touch_static: whether the hand touches the static link too.
+    asset: an id, a folder or an :class:`Asset`.  hand: name of a hand.  action, observation, reward: see above.
+    randomize: default of the reset option.  render_mode: None, "rgb_array" or "depth_array".  camera: "video" (where
+    the asset knows it) or "overview".  width, height: px.  touch_static: whether the hand touches the static link too.
 
     ## Version history
     ``TAA/<id>`` carries no version: the asset's folder says what it was made of.
@@ -105,8 +141,10 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     def __init__(self, asset: str | os.PathLike | Asset, hand: str = "points",
                  reward: str | Mapping[str, float] = "dense", render_mode: str | None = None,
                  camera: str | None = None, width: int | None = None, height: int = 480,
-                 touch_static: bool = False) -> None:
-        EzPickle.__init__(self, asset, hand, reward, render_mode, camera, width, height, touch_static)
+                 touch_static: bool = False, action: str = "residual", observation: str = "flat",
+                 randomize: Any = False) -> None:
+        EzPickle.__init__(self, asset, hand, reward, render_mode, camera, width, height, touch_static, action,
+                          observation, randomize)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"no render mode is named {render_mode!r}; known: {self.metadata['render_modes']}")
         self.asset = get_asset(asset)
@@ -115,151 +153,83 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         elif camera not in ("overview", "video") or (camera == "video" and self.asset.camera is None):
             raise ValueError(f"{self.asset.id} has no camera {camera!r}; known: overview"
                              + (", video" if self.asset.camera is not None else ""))
-        self.scales = reward_scales(reward)
         self.render_mode, self._camera = render_mode, camera
         picture = self.asset.camera if camera == "video" else None
         aspect = picture["width"] / picture["height"] if picture is not None else 4 / 3
         self._size = (round(height * aspect) if width is None else width, height)
-        self._scene = build_scene(self.asset, hand, touch_static=touch_static)
-        if self._scene.hand is None:
+        scene = build_scene(self.asset, hand, touch_static=touch_static)
+        if scene.hand is None:
             raise ValueError("the environment needs a hand; name one")
-        self._hand = self._scene.hand
-        self.simulation = Simulation(self._scene)
-        self.frame_skip = round(CONTROL_PERIOD / TIMESTEP)
-        self._path = HandPath(self.asset.reference.time, self.asset.reference.hand_joints)
-        model = self._scene.model
-        self._nominal = (model.dof_damping.copy(), model.dof_frictionloss.copy(), model.geom_friction.copy())
-        self._stroke = self.asset.demo["q_demo_end"] - self.asset.demo["q_start"]
+        self._rows = SingleRows(scene)
+        self.task = Task(scene, self._rows, action=action, reward=reward)
+        self.observation_space, self.action_space = spaces_of(self.task, observation)
+        self._observed, self._randomize = observation, randomize
+        if self.task.goal:  # elsewhere it would make Stable-Baselines3 take the environment for a goal-conditioned one
+            self.compute_reward = compute_reward
         self._renderer: Any = None
-        self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-        self.observation_space = spaces.Box(-10.0, 10.0, (5 + 63 + 63 + 7,), np.float32)
-        self._begin(0.0, self.asset.demo["q_start"], np.zeros(3))
+        self.task.begin(0, np.random.default_rng(0))
 
     @property
     def dt(self) -> float:
         """s of one step."""
         return CONTROL_PERIOD
 
-    def _begin(self, time: float, q0: float, offset: np.ndarray) -> None:
-        """time: s since the reference's first frame."""
-        self._start = float(self.asset.reference.time[0]) + time
-        self._offset = offset
-        self._count = 0
-        self._action = np.zeros(7, np.float32)
-        self._driven = 0.0
-        self._first = float(self.asset.stroke_fraction(q0))
-        self._hit = np.zeros(len(self.asset.reference.time), bool)
-        self._seen = np.zeros_like(self._hit)
-        self._last = Step()
-        self.simulation.reset(q0, self._path.at(self._start) + offset)
+    @property
+    def model(self) -> Any:
+        """The ``mujoco.MjModel``, as randomised."""
+        return self._rows.model
+
+    @property
+    def data(self) -> Any:
+        """The ``mujoco.MjData``."""
+        return self._rows.data
+
+    @property
+    def q(self) -> float:
+        """State of the object's joint, rad or m."""
+        return float(self.task.q[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None
-              ) -> tuple[np.ndarray, dict[str, Any]]:
+              ) -> tuple[Any, dict[str, Any]]:
         """See the class.
 
         Raises:
             ValueError: an option is unknown or out of range.
         """
         super().reset(seed=seed)
-        options = dict(options or {})
-        unknown = set(options) - set(RESET_OPTIONS)
-        if unknown:
-            raise ValueError(f"no reset option is named {', '.join(sorted(unknown))}; known: "
-                             + ", ".join(RESET_OPTIONS))
-        phase = float(options.get("phase", 0.0))
-        if not 0.0 <= phase <= 1.0:
-            raise ValueError(f"phase must lie in [0, 1], is {phase}")
-        reference, model = self.asset.reference, self._scene.model
-        time = phase * self.asset.demo["duration"]
-        low, high = model.jnt_range[model.joint("joint").id]
-        default = np.clip(np.interp(reference.time[0] + time, reference.time, reference.q), low, high)
-        q0 = float(options["q0"]) if options.get("q0") is not None else float(default)
-        if not low <= q0 <= high:
-            raise ValueError(f"q0 must lie in the joint's range [{low:.4g}, {high:.4g}] {self.asset.unit}, is {q0:.4g}")
-        self._begin(time, q0, self._randomize(options.get("randomize", False)))
-        return self._observation(), self._info({})
+        made = self.task.begin(0, self.np_random, options, self._randomize)
+        info = self._info({})
+        if made:
+            info["randomized"] = made
+        return self._observation(), info
 
-    def _randomize(self, wanted: bool | Mapping[str, float]) -> np.ndarray:
-        """Perturb the model; the hand's offset (3,) m."""
-        model, dof = self._scene.model, self._scene.dof
-        model.dof_damping[:], model.dof_frictionloss[:], model.geom_friction[:] = self._nominal
-        if not wanted:
-            return np.zeros(3)
-        amounts = dict(RANDOMIZE) if wanted is True else dict(wanted)
-        unknown = set(amounts) - set(RANDOMIZE)
-        if unknown:
-            raise ValueError(f"cannot randomize {', '.join(sorted(unknown))}; known: {', '.join(RANDOMIZE)}")
-        draw = {name: float(self.np_random.uniform(-1, 1)) * min(max(float(amounts.get(name, 0.0)), 0.0), 1.0)
-                for name in ("damping", "frictionloss", "friction")}
-        model.dof_damping[dof] *= 1 + draw["damping"]
-        model.dof_frictionloss[dof] *= 1 + draw["frictionloss"]
-        model.geom_friction[self._scene.hand_geoms, 0] *= 1 + draw["friction"]
-        return self.np_random.normal(0.0, max(float(amounts.get("hand", 0.0)), 0.0), 3)
-
-    @property
-    def _time(self) -> float:
-        return self._start + self._count * self._scene.model.opt.timestep
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See the class."""
-        action = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
-        total, diverged, reference = Step(), False, self.asset.reference
-        before = float(self.asset.stroke_fraction(self.simulation.q))
-        for _ in range(self.frame_skip):
-            t = self._time
-            joints = apply_residual(self._path.at(t + self._hand.lead), action) + self._offset
-            try:
-                made = self.simulation.step(joints)
-            except Diverged:
-                diverged = True
-                break
-            total.add(made)
-            frame = int(np.searchsorted(reference.time, t + 1e-9, side="right")) - 1
-            self._seen[frame] = True
-            self._hit[frame] |= made.contact
-            self._count += 1
-        driven = total.driven / abs(self._stroke)
-        self._driven += driven
-        self._last = total
-        success = not diverged and self._success()
-        contact_tips = self._hand.landmarks(self.simulation.data)[list(TIPS)]
-        terms = reward_terms(RewardInputs(
-            driven=driven, moved=float(self.asset.stroke_fraction(self.simulation.q)) - before, contact=total.contact,
-            distance=0.0 if total.contact else self.simulation.surface_distance(contact_tips),
-            penetration=total.penetration, action=action, previous_action=self._action, success=success), self.scales)
-        self._action = action.copy()
+        reward, terms = self.task.step(np.asarray(action, np.float32)[None])
         info = self._info(terms)
-        if diverged:
-            info["diverged"] = True
-        return self._observation(), float(sum(terms.values())), bool(success or diverged), False, info
+        return self._observation(), float(reward[0]), info["success_now"] or info["diverged"], False, info
 
-    def _success(self) -> bool:
-        progress = float(self.asset.progress(self.simulation.q))
-        made = progress - float(np.clip(self._first, 0.0, 1.0))
-        return progress >= SUCCESS_PROGRESS and made > 0 and self._driven >= DRIVEN_SHARE * made
+    def reference_action(self) -> np.ndarray:
+        """The action that follows the demonstrated hand in the next step."""
+        return self.task.reference_action()[0]
 
-    def _info(self, terms: dict[str, float]) -> dict[str, Any]:
-        wanted = self.asset.reference.contact & self._seen
-        return {"joint_progress": float(self.asset.progress(self.simulation.q)),
-                "final_q_error": self.asset.final_q_error(self.simulation.q), "is_success": self._success(),
-                "contact": bool(self._last.contact),
-                "contact_fraction": float(self._hit[wanted].mean()) if wanted.any() else 0.0,
-                "reward_terms": dict(terms)}
+    def get_state(self) -> dict[str, Any]:
+        """Snapshot of the episode and of the generator; plain arrays and numbers, copies."""
+        return {**self.task.snapshot(0), "generator": self.np_random.bit_generator.state}
 
-    def _observation(self) -> np.ndarray:
-        asset, sim, duration = self.asset, self.simulation, self.asset.demo["duration"]
-        t = self._time
-        here = self._hand.landmarks(sim.data)
-        demo_q = np.interp(t, asset.reference.time, asset.reference.q)
-        parts = [
-            [float(asset.stroke_fraction(sim.q)), sim.qvel * duration / self._stroke,
-             min((t - asset.reference.time[0]) / duration, 1.0), float(asset.stroke_fraction(demo_q)),
-             float(self._last.contact)],
-            ((here - self._scene.centre) / self._scene.size).ravel(),
-            ((self._path.at(t) + self._offset - here) / 0.02).ravel(),
-            self._action,
-        ]
-        return np.clip(np.concatenate(parts), -10.0, 10.0).astype(np.float32)
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Take a snapshot of :meth:`get_state`; what follows is what followed there."""
+        self.task.restore(0, state)
+        self.np_random.bit_generator.state = state["generator"]
+
+    def _info(self, terms: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        info: dict[str, Any] = {name: value[0].item() for name, value in self.task.info().items()}
+        info["reward_terms"] = {name: float(value[0]) for name, value in terms.items()}
+        return info
+
+    def _observation(self) -> Any:
+        made = observe(self.task, self._observed)
+        return {name: value[0] for name, value in made.items()} if isinstance(made, dict) else made[0]
 
     def render(self) -> np.ndarray | None:
         """(height, width, 3) uint8, or (height, width) float32 m for "depth_array"; None without a render mode."""
@@ -269,13 +239,17 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         if self._renderer is None:
             import mujoco
 
-            self._renderer = mujoco.Renderer(self._scene.model, height=self._size[1], width=self._size[0])
+            self._renderer = mujoco.Renderer(self.model, height=self._size[1], width=self._size[0])
             if self.render_mode == "depth_array":
                 self._renderer.enable_depth_rendering()
-        self._renderer.update_scene(self.simulation.data, camera=self._camera)
+        self._renderer.update_scene(self.data, camera=self._camera)
         return self._renderer.render().copy()
 
     def close(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+__all__ = ["ACTIONS", "DRIVEN_SHARE", "SUCCESS_PROGRESS", "ArticulationEnv", "apply_residual", "compute_reward",
+           "observe", "spaces_of"]

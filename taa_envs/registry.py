@@ -18,6 +18,7 @@ from taa_envs.errors import AssetError, UnknownAsset
 
 NAMESPACE = "TAA"
 ENTRY_POINT = "taa_envs.env:ArticulationEnv"
+VECTOR_ENTRY_POINT = "taa_envs.vector:BatchedArticulationEnv"
 CONTROL_PERIOD = 0.02  # s, of one environment step
 TIME_LIMIT_SHARE = 1.5  # of the demonstration's length, before an episode is truncated
 
@@ -129,7 +130,7 @@ def register_assets() -> list[str]:
         if spec.entry_point == ENTRY_POINT:
             del gymnasium.registry[env_id]
     for asset_id, (folder, metadata) in assets.items():
-        gymnasium.register(id=f"{NAMESPACE}/{asset_id}", entry_point=ENTRY_POINT,
+        gymnasium.register(id=f"{NAMESPACE}/{asset_id}", entry_point=ENTRY_POINT, vector_entry_point=VECTOR_ENTRY_POINT,
                            max_episode_steps=max_episode_steps(metadata["demo"]["duration"]),
                            kwargs={"asset": str(folder)})
     return sorted(f"{NAMESPACE}/{asset_id}" for asset_id in assets)

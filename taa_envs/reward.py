@@ -6,8 +6,10 @@ progress       part of the stroke made in this step while the hand's contact did
 reach          ``-tanh(d / 0.1 m)`` of the finger tips' distance d to the moving link, 0 in contact
 action_rate    minus the mean squared change of the action
 penetration    minus the overlap of hand and link beyond 5 mm, in units of 5 mm, at most 1
-success        1 in the step in which the episode succeeds
+success        1 in a step in which the episode's state is a success
 =============  ========================================================================================
+
+``"sparse_goal"`` has no terms: its reward is :func:`goal_reward`, 0 where the goal is reached and -1 elsewhere.
 """
 
 from __future__ import annotations
@@ -21,23 +23,28 @@ TERMS = ("progress", "reach", "action_rate", "penetration", "success")
 SCALES: dict[str, dict[str, float]] = {
     "dense": {"progress": 10.0, "reach": 0.02, "action_rate": 0.01, "penetration": 0.02, "success": 5.0},
     "sparse": {"success": 1.0},
+    "sparse_goal": {},
 }
 REACH_SCALE = 0.1  # m
 FREE_PENETRATION = 0.005  # m
+SUCCESS_PROGRESS = 0.95
+DRIVEN_SHARE = 0.8  # of the progress made, what contact must have driven for a success
+GOAL = (1.0, DRIVEN_SHARE)
 
 
 @dataclass(frozen=True)
 class RewardInputs:
-    """What a step did: fractions of the stroke, metres, the action before and now, and whether it succeeded."""
+    """What a step did, each a number or an array (n,): fractions of the stroke, whether the hand pushed, m, the actions
+    (..., A) now and before, and whether the state is a success."""
 
-    driven: float
-    moved: float
-    contact: bool
-    distance: float
-    penetration: float
+    driven: np.ndarray | float
+    moved: np.ndarray | float
+    contact: np.ndarray | bool
+    distance: np.ndarray | float
+    penetration: np.ndarray | float
     action: np.ndarray
     previous_action: np.ndarray
-    success: bool
+    success: np.ndarray | bool
 
 
 def reward_scales(reward: str | Mapping[str, float]) -> dict[str, float]:
@@ -56,13 +63,35 @@ def reward_scales(reward: str | Mapping[str, float]) -> dict[str, float]:
     return {name: float(value) for name, value in reward.items()}
 
 
-def reward_terms(step: RewardInputs, scales: Mapping[str, float]) -> dict[str, float]:
-    """Term name -> scaled value, of the terms that have a scale."""
-    raw = {
-        "progress": step.driven + min(step.moved, 0.0),
-        "reach": 0.0 if step.contact else -float(np.tanh(step.distance / REACH_SCALE)),
-        "action_rate": -float(np.mean((step.action - step.previous_action) ** 2)),
-        "penetration": -float(np.clip((step.penetration - FREE_PENETRATION) / FREE_PENETRATION, 0.0, 1.0)),
-        "success": float(step.success),
-    }
-    return {name: scale * raw[name] for name, scale in scales.items()}
+def reward_terms(step: RewardInputs, scales: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Term name -> scaled value (of the inputs' shape), of the terms that have a scale."""
+    out: dict[str, np.ndarray] = {}
+    for name, scale in scales.items():
+        if name == "progress":
+            raw = step.driven + np.minimum(step.moved, 0.0)
+        elif name == "reach":
+            raw = np.where(step.contact, 0.0, -np.tanh(np.asarray(step.distance) / REACH_SCALE))
+        elif name == "action_rate":
+            change = np.asarray(step.action, float) - step.previous_action
+            raw = -np.mean(change * change, axis=-1)
+        elif name == "penetration":
+            over = (np.asarray(step.penetration, float) - FREE_PENETRATION) / FREE_PENETRATION
+            raw = -np.minimum(np.maximum(over, 0.0), 1.0)
+        else:
+            raw = np.asarray(step.success, float)
+        out[name] = scale * raw
+    return out
+
+
+def goal_reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    """0 where the goal is reached, else -1.
+
+    Args:
+        achieved: (..., 2): fraction of the stroke, and the share of the progress made that contact drove, in [0, 1].
+        desired: (..., 2): the same; reached within 5 % of the stroke, and with that share or :data:`DRIVEN_SHARE`.
+    """
+    achieved, desired = np.asarray(achieved, float), np.asarray(desired, float)
+    tolerance = 1e-6  # goals are float32
+    reached = ((achieved[..., 0] >= desired[..., 0] - (1 - SUCCESS_PROGRESS) - tolerance)
+               & (achieved[..., 1] >= np.minimum(desired[..., 1], DRIVEN_SHARE) - tolerance))
+    return reached.astype(float) - 1.0

@@ -53,10 +53,10 @@ def score_actions(asset: Asset, actions: np.ndarray, hand: str = "points") -> di
     if actions.ndim != 2 or actions.shape[1] != ACTIONS or not np.isfinite(actions).all():
         raise ValueError(f"actions must be (N, {ACTIONS}) finite numbers, have shape {actions.shape}")
     _, info = env.reset(seed=0)
-    q = [env.simulation.q]
+    q = [env.q]
     for action in np.clip(actions, -1, 1):
         _, _, terminated, _, info = env.step(action)
-        q.append(env.simulation.q)
+        q.append(env.q)
         if terminated:
             break
     scores = score_joint_log(asset, env.dt * np.arange(len(q)), np.array(q))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import pickle
+import re
 import warnings
 
 import gymnasium
@@ -14,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 import taa_envs
 from taa_envs.asset import Asset
 from taa_envs.env import ArticulationEnv, apply_residual
+from taa_envs.registry import max_episode_steps
 from taa_envs.replay import replay
 
 ZERO = np.zeros(7, np.float32)
@@ -57,7 +60,7 @@ def test_zero_action_is_the_open_loop_replay(name: str, request: pytest.FixtureR
     for i in range(1, 90):
         env.step(ZERO)
         if i % 5 == 0:  # every 0.1 s is a step's end and a frame of the 30 Hz reference
-            assert env.simulation.q == pytest.approx(run.q[3 * i // 5], abs=2e-3 * abs(asset.demo["q_demo_end"]))
+            assert env.q == pytest.approx(run.q[3 * i // 5], abs=2e-3 * abs(asset.demo["q_demo_end"]))
 
 
 def test_demonstration_succeeds_and_says_so() -> None:
@@ -112,24 +115,129 @@ def test_same_seed_same_episode() -> None:
     assert not np.array_equal(episode(3), episode(4))
 
 
+def test_dict_observation_is_the_flat_one_in_parts(door: Asset) -> None:
+    flat, parts = (ArticulationEnv(door, observation=kind) for kind in ("flat", "dict"))
+    a, b = flat.reset(seed=0)[0], parts.reset(seed=0)[0]
+    for _ in range(45):
+        np.testing.assert_array_equal(a, np.concatenate(list(b.values())))
+        assert parts.observation_space.contains(b) and flat.observation_space.contains(a)
+        a, b = flat.step(ZERO)[0], parts.step(ZERO)[0]
+    assert b["contact"][0] == 1 and b["contact"][2] > 0  # the door is pulled towards +y
+    assert b["contact"][4] > 0  # and the pull turns it the demonstrated way
+
+
+def test_the_documentation_says_what_is_there(door: Asset) -> None:
+    text = ArticulationEnv.__doc__
+    for kind, size in (("residual", 7), ("absolute", 63)):
+        env = ArticulationEnv(door, action=kind)
+        assert env.action_space.shape == (size,) and f"Box(-1, 1, ({size},), float32)" in text
+        assert str(env.observation_space.shape[0]) in text
+    env = ArticulationEnv(door)
+    start = 0
+    for name, count in env.task.observation_parts.items():
+        first = re.search(rf"\| {name} \| (\d+)", text)
+        assert first and int(first[1]) == start
+        start += count
+    _, info = env.reset(seed=0, options={"randomize": True})
+    assert all(f"``{name}``" in text for name in info)
+    for name in inspect.signature(ArticulationEnv).parameters:
+        assert f"{name}:" in text or f"{name}, " in text or f"{name}=" in text
+
+
+def test_absolute_zero_and_random_actions_fail_and_the_reference_succeeds(door: Asset, drawer: Asset) -> None:
+    for asset in (door, drawer):
+        env = ArticulationEnv(asset, action="absolute", reward="sparse")
+        rng = np.random.default_rng(0)
+        limit = max_episode_steps(asset.demo["duration"])
+        for actions in (np.zeros((limit, 63)), rng.uniform(-1, 1, (limit, 63))):
+            env.reset(seed=0)
+            assert sum(env.step(action)[1] for action in actions) == 0
+        env.reset(seed=0)
+        assert any(env.step(env.reference_action())[2] for _ in range(limit))
+
+
+def test_success_is_latched_and_instantaneous(door: Asset) -> None:
+    env = ArticulationEnv(door)
+    env.reset(seed=0)
+    while not env.step(ZERO)[4]["success_now"]:
+        pass
+    env.data.qvel[env.task.scene.dof] = -3.0  # somebody slams it
+    for _ in range(30):
+        info = env.step(np.array([1, 1, 0, 0, 0, 0, -1], np.float32))[4]
+    assert info["joint_progress"] < 0.9 and info["is_success"] and not info["success_now"]
+
+
+def test_flung_door_earns_nothing_and_never_succeeds(door: Asset) -> None:
+    env = ArticulationEnv(door, action="absolute")
+    env.reset(seed=0)
+    env.data.qvel[env.task.scene.dof] = 20.0
+    total, info = 0.0, {}
+    for _ in range(60):
+        _, _, terminated, _, info = env.step(np.zeros(63, np.float32))
+        total += info["reward_terms"]["progress"]
+        assert not terminated
+    assert info["joint_progress"] > 0.5 and total <= 1e-9 and not info["is_success"]
+
+
+def test_goal_conditioned(door: Asset) -> None:
+    env = gymnasium.make("TAA/door", reward="sparse_goal")
+    seen, _ = env.reset(seed=0)
+    rewards = []
+    for _ in range(env.spec.max_episode_steps):
+        seen, reward, terminated, truncated, info = env.step(ZERO)
+        assert reward == env.unwrapped.compute_reward(seen["achieved_goal"], seen["desired_goal"], info)
+        assert (reward == 0.0) == info["success_now"]
+        rewards.append(reward)
+        if terminated:
+            break
+    assert rewards[-1] == 0.0 and set(rewards[:-1]) == {-1.0}
+    np.testing.assert_allclose(seen["achieved_goal"][0], info["joint_progress"], atol=1e-6)
+    with pytest.raises(ValueError, match="sparse_goal"):
+        ArticulationEnv(door, reward="sparse_goal", observation="dict")
+
+
+def test_a_snapshot_goes_on_as_the_episode_did(door: Asset) -> None:
+    env, other = ArticulationEnv(door, randomize=True), ArticulationEnv(door)
+    env.reset(seed=3)
+    for _ in range(50):
+        env.step(ZERO)
+    state = pickle.loads(pickle.dumps(env.get_state()))
+    first = [env.step(ZERO) for _ in range(20)]
+    first_reset = env.reset()[0]
+    for again in (env, other):
+        again.set_state(state)
+        for a in first:
+            b = again.step(ZERO)
+            np.testing.assert_array_equal(a[0], b[0])
+            assert a[1] == b[1] and a[4] == b[4]
+    np.testing.assert_array_equal(first_reset, env.reset()[0])
+
+
+def test_unknown_names_are_refused_with_the_known_ones(door: Asset) -> None:
+    for bad, message in (({"action": "torque"}, "residual"), ({"observation": "pixels"}, "flat"),
+                         ({"reward": "rich"}, "dense")):
+        with pytest.raises(ValueError, match=f"known: {message}"):
+            ArticulationEnv(door, **bad)
+
+
 def test_randomization_ends_with_its_episode(door: Asset) -> None:
     env = ArticulationEnv(door)
-    damping = env.simulation.model.dof_damping.copy()
+    damping = env.model.dof_damping.copy()
     env.reset(seed=0, options={"randomize": {"damping": 0.5}})
-    assert not np.array_equal(env.simulation.model.dof_damping, damping)
+    assert not np.array_equal(env.model.dof_damping, damping)
     env.reset()
-    np.testing.assert_array_equal(env.simulation.model.dof_damping, damping)
+    np.testing.assert_array_equal(env.model.dof_damping, damping)
 
 
 def test_reset_options(door: Asset) -> None:
     env = ArticulationEnv(door)
     env.reset(options={"q0": 0.7})
-    assert env.simulation.q == 0.7
+    assert env.q == 0.7
     env.reset(options={"phase": 0.5})
     middle = np.interp(0.5 * door.demo["duration"], door.reference.time, door.reference.q)
-    assert env.simulation.q == pytest.approx(middle)
+    assert env.q == pytest.approx(middle)
     for bad, message in (({"q0": 9.0}, "range"), ({"phase": 2}, "phase"), ({"speed": 1}, "known: q0"),
-                         ({"randomize": {"colour": 1}}, "known: hand")):
+                         ({"randomize": {"colour": 1}}, "known: axis")):
         with pytest.raises(ValueError, match=message):
             env.reset(options=bad)
 
@@ -150,7 +258,7 @@ def test_what_is_returned_is_never_written_to_again(door: Asset) -> None:
 def test_pickles_as_made() -> None:
     env = gymnasium.make("TAA/door", reward="sparse").unwrapped
     again = pickle.loads(pickle.dumps(env))
-    assert again.asset.id == "door" and again.scales == {"success": 1.0}
+    assert again.asset.id == "door" and again.task.scales == {"success": 1.0}
     np.testing.assert_array_equal(env.reset(seed=1)[0], again.reset(seed=1)[0])
 
 
@@ -174,7 +282,7 @@ def test_make_through_the_module() -> None:
 
 def test_residual_moves_turns_and_closes(door: Asset) -> None:
     joints = door.reference.hand_joints[0]
-    np.testing.assert_array_equal(apply_residual(joints, ZERO), joints)
+    np.testing.assert_allclose(apply_residual(joints, ZERO), joints, atol=1e-15)
     moved = apply_residual(joints, np.array([1, 0, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(moved - joints, np.tile([0.03, 0, 0], (21, 1)), atol=1e-12)
     turned = apply_residual(joints, np.array([0, 0, 0, 0, 0, 1, 0]))
@@ -183,4 +291,4 @@ def test_residual_moves_turns_and_closes(door: Asset) -> None:
     np.testing.assert_allclose(np.linalg.norm(turned[8] - turned[0]), np.linalg.norm(joints[8] - joints[0]))
     closed = apply_residual(joints, np.array([0, 0, 0, 0, 0, 0, 1]))
     assert np.linalg.norm(closed[4] - closed[8]) == pytest.approx(0.5 * np.linalg.norm(joints[4] - joints[8]))
-    np.testing.assert_array_equal(closed[palm], joints[palm])
+    np.testing.assert_allclose(closed[palm], joints[palm], atol=1e-15)

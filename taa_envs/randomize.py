@@ -1,0 +1,130 @@
+"""Domain randomisation: what the reconstruction knows that it does not know.
+
+Every amount comes from the asset: the ``std`` of the entry of that name in its provenance. Nothing is drawn for a
+number that has none, but for the assumed forces and masses: a video carries no force, the asset says ``assumed``, and an
+assumption is taken to hold within a factor of two (:data:`ASSUMED_FACTOR`, one standard deviation), the one number here
+that no asset gives.
+
+==============  ======================================  ================================================================
+name            standard deviation                      what is drawn
+==============  ======================================  ================================================================
+axis            ``joint.axis`` std, rad                 a tilt of the axis in a random direction across it
+point           ``joint.point`` std, m                  a shift of the pivot across the axis (revolute joints)
+scale           ``scale`` std, relative                 the size of everything, s: at equal density, hand force and time
+                                                        the link's inertia in the asset's units goes with s^4
+mass            ``moving.mass`` std / value             a factor on mass and inertia, log-normal
+damping         ``joint.damping`` std / value           a factor, log-normal
+frictionloss    ``joint.frictionloss`` std / value      a factor, log-normal
+hand            ``hand.offset`` std, m; where absent    a shift of the whole demonstrated hand against the object
+                that of ``joint.point``
+==============  ======================================  ================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from taa_envs.asset import Asset
+
+NAMES = ("axis", "point", "scale", "mass", "damping", "frictionloss", "hand")
+ASSUMED_FACTOR = 2.0
+_ENTRIES = {"axis": "joint.axis", "point": "joint.point", "scale": "scale", "mass": "moving.mass",
+            "damping": "joint.damping", "frictionloss": "joint.frictionloss", "hand": "hand.offset"}
+_FACTORS = ("mass", "damping", "frictionloss")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One draw. axis: (3,) unit, asset frame.  point: (3,) m.  mass, damping, frictionloss: factors on the model's
+    numbers (mass: of the inertia too).  hand: (3,) m."""
+
+    axis: np.ndarray
+    point: np.ndarray
+    mass: float = 1.0
+    damping: float = 1.0
+    frictionloss: float = 1.0
+    hand: np.ndarray | None = None
+
+    def as_dict(self) -> dict:
+        """The draw as arrays, for ``info``; copies."""
+        return {"axis": self.axis.copy(), "point": self.point.copy(), "mass": self.mass, "damping": self.damping,
+                "frictionloss": self.frictionloss, "hand": np.zeros(3) if self.hand is None else self.hand.copy()}
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, (int, float)) and np.isfinite(value) and value >= 0 else None
+
+
+def uncertainties(asset: Asset) -> dict[str, float]:
+    """Name -> standard deviation, of the names in :data:`NAMES` about which the asset says something."""
+    out: dict[str, float] = {}
+    for name, key in _ENTRIES.items():
+        entry = asset.provenance.get(key) or {}
+        std, value = _number(entry.get("std")), _number(entry.get("value"))
+        if name in _FACTORS:
+            if std is not None and value:
+                out[name] = float(np.log1p(std / value))
+            elif entry.get("origin") == "assumed":
+                out[name] = float(np.log(ASSUMED_FACTOR))
+        elif std is not None:
+            out[name] = std
+    if asset.joint_type == "prismatic":
+        out.pop("point", None)
+    point = _number((asset.provenance.get("joint.point") or {}).get("std"))
+    if "hand" not in out and point is not None:
+        out["hand"] = point
+    return out
+
+
+def chosen(asset: Asset, wanted: bool | Iterable[str] | Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations to draw with: all the asset's (True), those of some names, or given ones.
+
+    Raises:
+        ValueError: a name is unknown, or an amount is not a finite number >= 0.
+    """
+    if wanted is True or wanted is False:
+        return uncertainties(asset) if wanted else {}
+    unknown = set(wanted) - set(NAMES)
+    if unknown:
+        raise ValueError(f"cannot randomize {', '.join(sorted(unknown))}; known: {', '.join(NAMES)}")
+    if isinstance(wanted, Mapping):
+        if any(_number(v) is None for v in wanted.values()):
+            raise ValueError("amounts of randomize must be finite and not negative")
+        return {name: float(value) for name, value in wanted.items()}
+    return {name: std for name, std in uncertainties(asset).items() if name in set(wanted)}
+
+
+def nominal(asset: Asset, model_axis: np.ndarray, model_point: np.ndarray) -> Draw:
+    """No randomisation at all."""
+    return Draw(np.array(model_axis, float), np.array(model_point, float), hand=np.zeros(3))
+
+
+def draw(rng: np.random.Generator, std: Mapping[str, float], axis: np.ndarray, point: np.ndarray) -> Draw:
+    """One draw about a joint's axis (3,) and point (3,) m with the standard deviations of :func:`chosen`.
+
+    The generator is asked for the same numbers whatever the standard deviations are.
+    """
+    normal = rng.standard_normal(11)
+    across = np.linalg.svd(axis[None])[2][1:]  # (2, 3)
+    # Two directions share the angle's variance, and the shift's.
+    tilt = (normal[:2] @ across) * std.get("axis", 0.0) / np.sqrt(2)
+    shift = (normal[2:4] @ across) * std.get("point", 0.0) / np.sqrt(2)
+    angle = float(np.linalg.norm(tilt))
+    turned = axis if angle == 0.0 else np.cos(angle) * axis + np.sin(angle) * tilt / angle
+    factor = {name: float(np.exp(std.get(name, 0.0) * normal[4 + i])) for i, name in enumerate(_FACTORS)}
+    size = float(np.exp(std.get("scale", 0.0) * normal[7]))
+    return Draw(turned / np.linalg.norm(turned), point + shift, factor["mass"] * size**4, factor["damping"],
+                factor["frictionloss"], normal[8:11] * std.get("hand", 0.0) / np.sqrt(3))
+
+
+def write(fields: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], made: Draw, joint: int, body: int,
+          dof: int) -> None:
+    """Write a draw into model fields, relative to what they were; ``before`` holds copies of them."""
+    fields["jnt_axis"][joint], fields["jnt_pos"][joint] = made.axis, made.point
+    for name in ("body_mass", "body_inertia"):
+        fields[name][body] = before[name][body] * made.mass
+    fields["dof_damping"][dof] = before["dof_damping"][dof] * made.damping
+    fields["dof_frictionloss"][dof] = before["dof_frictionloss"][dof] * made.frictionloss

@@ -1,0 +1,76 @@
+"""Domain randomisation from the asset's own uncertainties."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from taa_envs import randomize
+from taa_envs.asset import Asset
+from taa_envs.env import ArticulationEnv
+
+
+def with_provenance(asset: Asset, **entries: dict) -> Asset:
+    return dataclasses.replace(asset, provenance={**asset.provenance, **{k.replace("__", "."): v
+                                                                         for k, v in entries.items()}})
+
+
+def test_amounts_are_the_assets_own(door: Asset, drawer: Asset) -> None:
+    std = randomize.uncertainties(door)
+    assert std["axis"] == pytest.approx(np.deg2rad(1.0)) and std["point"] == std["hand"] == 0.002
+    assert std["mass"] == std["damping"] == np.log(2) and "scale" not in std
+    assert "point" not in randomize.uncertainties(drawer) and "hand" not in randomize.uncertainties(drawer)
+    known = with_provenance(door, joint__damping={"value": 2.0, "std": 0.2, "origin": "fitted"},
+                            scale={"value": 1.0, "std": 0.1, "origin": "fitted"},
+                            moving__mass={"value": 3.0, "origin": "given"},
+                            hand__offset={"value": 0.0, "std": 0.004, "origin": "fitted"})
+    std = randomize.uncertainties(known)
+    assert std["damping"] == pytest.approx(np.log(1.1)) and std["scale"] == 0.1 and std["hand"] == 0.004
+    assert "mass" not in std  # given, and nothing said about how well
+
+
+def test_draws_have_the_stated_spread() -> None:
+    rng = np.random.default_rng(0)
+    axis, point = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.2, 0.3])
+    std = {"axis": 0.02, "point": 0.01, "hand": 0.005, "mass": 0.5, "scale": 0.1}
+    draws = [randomize.draw(rng, std, axis, point) for _ in range(4000)]
+    angles = np.array([np.arccos(d.axis @ axis) for d in draws])
+    shifts = np.array([d.point - point for d in draws])
+    assert np.sqrt((angles**2).mean()) == pytest.approx(0.02, rel=0.05)
+    assert np.sqrt((shifts**2).sum(1).mean()) == pytest.approx(0.01, rel=0.05)
+    assert np.abs(shifts @ axis).max() < 1e-12
+    assert np.sqrt((np.array([d.hand for d in draws]) ** 2).sum(1).mean()) == pytest.approx(0.005, rel=0.05)
+    assert np.log([d.mass for d in draws]).std() == pytest.approx(np.hypot(0.5, 0.4), rel=0.05)
+    assert all(d.damping == 1.0 for d in draws)
+
+
+def test_the_model_gets_what_was_drawn_and_loses_it_again(door: Asset) -> None:
+    env = ArticulationEnv(door)
+    model, joint, dof = env.model, env.model.joint("joint").id, env.task.scene.dof
+    body = env.model.body("moving").id
+    before = {name: getattr(model, name).copy() for name in ("jnt_axis", "jnt_pos", "body_mass", "body_inertia",
+                                                             "dof_damping", "dof_M0")}
+    _, info = env.reset(seed=0, options={"randomize": True})
+    made = info["randomized"]
+    np.testing.assert_array_equal(model.jnt_axis[joint], made["axis"])
+    np.testing.assert_array_equal(model.jnt_pos[joint], made["point"])
+    assert model.body_mass[body] == pytest.approx(before["body_mass"][body] * made["mass"])
+    np.testing.assert_allclose(model.dof_damping[dof], before["dof_damping"][dof] * made["damping"])
+    assert model.dof_M0[dof] != before["dof_M0"][dof]
+    env.reset()
+    for name, value in before.items():
+        np.testing.assert_allclose(getattr(model, name), value, rtol=1e-12)
+
+
+def test_names_choose(door: Asset) -> None:
+    env = ArticulationEnv(door, randomize=["damping"])
+    _, info = env.reset(seed=0)
+    made = info["randomized"]
+    assert made["damping"] != 1 and made["mass"] == 1 and not made["hand"].any()
+    _, info = env.reset(options={"randomize": {"hand": 0.01}})
+    assert info["randomized"]["hand"].any() and info["randomized"]["damping"] == 1
+    for bad in ({"hand": -1.0}, {"hand": float("nan")}):
+        with pytest.raises(ValueError, match="finite"):
+            env.reset(options={"randomize": bad})
