@@ -1,7 +1,7 @@
 """State of one or of many simulations of a scene as arrays with a leading axis of simulations.
 
 :class:`SingleRows` steps one ``MjData`` with ``mj_step``, :class:`BatchRows` many with ``mujoco.batch``. What is
-written on top of them (:mod:`taa_envs.task`) does not know which it has; that is why a batched episode equals a single one.
+written on top of them (:mod:`taa_envs.task`) does not know which it has: a batched episode equals a single one.
 """
 
 from __future__ import annotations
