@@ -34,57 +34,125 @@ class CameraMotion:
 
 
 def estimate_camera_motion(video: Video, seed: int = 0) -> CameraMotion:
-    """Homographies to the first frame from corners that agree with the dominant motion.
+    """Homographies to the first view from corners that agree with the dominant motion.
+
+    Every frame is registered against one reference frame. The first is tried first; where it is too unlike the others
+    (an exposure that settles, an object held before the lens) a later one serves. Frames that fail one by one, and
+    those that jump against their neighbours, are filled in from these.
 
     Raises:
-        TaaError: the view changes so much that the first frame's background is lost (a cut, a pan).
+        TaaError: the view changes so much that no frame's background is found in the others (a cut, a pan).
     """
     import cv2
 
     cv2.setRNGSeed(seed)
-    frames = video.frames
-    T, h, w = frames.shape[:3]
-    grey0 = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)
-    points = _grid_corners(grey0, per_cell=6)
-    H = np.tile(np.eye(3), (T, 1, 1))
-    drift, support = np.zeros(T), np.ones(T)
-    residuals = []
-    if len(points) < 12:
-        # Too little texture to say anything: the common case, a static camera, is assumed.
-        return CameraMotion(True, H, drift, float("nan"), np.zeros(T))
-    lk = dict(winSize=(21, 21), maxLevel=3)
-    guess = points.copy()
-    alive = np.ones(len(points), bool)
-    for t in range(1, T):
-        grey = cv2.cvtColor(frames[t], cv2.COLOR_BGR2GRAY)
-        nxt, ok, _ = cv2.calcOpticalFlowPyrLK(
-            grey0, grey, points, guess.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **lk
+    T = len(video)
+    grey = [_levelled(f) for f in video.frames]
+    best: _Registration | None = None
+    for reference in dict.fromkeys((0, T // 2, T - 1)):
+        tried = _register(grey, reference)
+        if tried is None:
+            # Too little texture to say anything: the common case, a static camera, is assumed.
+            return CameraMotion(True, np.tile(np.eye(3), (T, 1, 1)), np.zeros(T), float("nan"), np.zeros(T))
+        if best is None or tried.good.mean() > best.good.mean() + 0.05:
+            best = tried
+        if best.good.mean() > 0.95:
+            break
+    assert best is not None
+    if best.good.mean() < 0.8:
+        when = video.time[int(np.argmin(best.good))]
+        raise TaaError(
+            f"the background is lost at {when:.2f} s (camera cut, pan or very fast motion); "
+            "cut the video so that the object stays in view"
         )
-        back, ok2, _ = cv2.calcOpticalFlowPyrLK(
-            grey, grey0, nxt, points.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **lk
-        )
-        alive = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(back - points, axis=-1).ravel() < 1.0)
-        if alive.sum() < 12:
-            raise TaaError(
-                f"the background of the first frame is lost at {video.time[t]:.2f} s (camera cut or pan); "
-                "cut the video so that the object stays in view"
-            )
-        found, inlier = cv2.findHomography(nxt[alive], points[alive], cv2.RANSAC, 1.5)
-        share = 0.0 if inlier is None else float(inlier.mean())
-        if found is None or share < 0.25:
-            raise TaaError(
-                f"no common background motion at {video.time[t]:.2f} s (camera cut or very fast motion); "
-                "cut the video so that the object stays in view"
-            )
-        H[t], support[t] = found, share
-        keep = np.flatnonzero(alive)[inlier.ravel() > 0]
-        drift[t] = np.median(np.linalg.norm(nxt[keep] - points[keep], axis=-1))
-        warped = cv2.perspectiveTransform(nxt[keep], found)
-        residuals.append(np.median(np.linalg.norm(warped - points[keep], axis=-1)))
-        # Predict the next frame from this homography, so that slow drift never outruns the search window.
-        guess = cv2.perspectiveTransform(points, np.linalg.inv(found)).astype(np.float32)
+    H = _without_jumps(best.H, best.good, video.frames.shape[1:3])
+    H = np.linalg.inv(H[0]) @ H
+    h, w = video.frames.shape[1:3]
+    probe = np.array([[[x, y] for x in (0.2 * w, 0.5 * w, 0.8 * w) for y in (0.2 * h, 0.5 * h, 0.8 * h)]])
+    drift = np.array([np.median(np.linalg.norm(cv2.perspectiveTransform(probe, M) - probe, axis=-1)) for M in H])
     static = bool(np.quantile(drift, 0.9) < STATIC_PX)
-    return CameraMotion(static, H, drift, float(np.median(residuals)), support)
+    return CameraMotion(static, H, drift, float(np.median(best.residual[best.good])), best.support)
+
+
+@dataclass(frozen=True)
+class _Registration:
+    """H: (T, 3, 3) to the reference.  good: (T,) bool.  support: (T,) share.  residual: (T,) px."""
+
+    H: np.ndarray
+    good: np.ndarray
+    support: np.ndarray
+    residual: np.ndarray
+
+
+def _levelled(image: np.ndarray) -> np.ndarray:
+    """(h, w) uint8 with local brightness and contrast evened out: exposure changes are not motion."""
+    import cv2
+
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    mean = cv2.GaussianBlur(grey, (0, 0), 12)
+    spread = np.sqrt(cv2.GaussianBlur((grey - mean) ** 2, (0, 0), 12)) + 6.0
+    return np.clip(128 + 48 * (grey - mean) / spread, 0, 255).astype(np.uint8)
+
+
+def _register(grey: list[np.ndarray], reference: int) -> _Registration | None:
+    """Homographies of all frames to one; None where the reference has too little texture."""
+    import cv2
+
+    T = len(grey)
+    points = _grid_corners(grey[reference], per_cell=6)
+    if len(points) < 12:
+        return None
+    H, good = np.tile(np.eye(3), (T, 1, 1)), np.zeros(T, bool)
+    support, residual = np.zeros(T), np.zeros(T)
+    good[reference], support[reference] = True, 1.0
+    lk = dict(winSize=(21, 21), maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    for order in (range(reference + 1, T), range(reference - 1, -1, -1)):
+        guess = points.copy()
+        for t in order:
+            nxt, ok, _ = cv2.calcOpticalFlowPyrLK(grey[reference], grey[t], points, guess.copy(), **lk)
+            back, ok2, _ = cv2.calcOpticalFlowPyrLK(grey[t], grey[reference], nxt, points.copy(), **lk)
+            alive = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(back - points, axis=-1).ravel() < 1.0)
+            if alive.sum() < 12:
+                continue
+            found, inlier = cv2.findHomography(nxt[alive], points[alive], cv2.RANSAC, 1.5)
+            if found is None or inlier.mean() < 0.25:
+                continue
+            H[t], support[t], good[t] = found, float(inlier.mean()), True
+            keep = np.flatnonzero(alive)[inlier.ravel() > 0]
+            warped = cv2.perspectiveTransform(nxt[keep], found)
+            residual[t] = np.median(np.linalg.norm(warped - points[keep], axis=-1))
+            # Predict the next frame from this one, so that slow drift never outruns the search window.
+            guess = cv2.perspectiveTransform(points, np.linalg.inv(found)).astype(np.float32)
+    return _Registration(H, good, support, residual)
+
+
+def _without_jumps(H: np.ndarray, good: np.ndarray, size: tuple[int, int], reach: int = 4) -> np.ndarray:
+    """Homographies with missing frames and single-frame jumps replaced: cameras in hands do not jump and come back.
+
+    Works on where four inner picture points go, (T, 4, 2): a frame that is farther than 3 px from the median of its
+    neighbours counts as missing, and missing frames are interpolated in time.
+    """
+    import cv2
+
+    h, w = size
+    corners = np.float32([[[0.2 * w, 0.2 * h], [0.8 * w, 0.2 * h], [0.8 * w, 0.8 * h], [0.2 * w, 0.8 * h]]])
+    path = np.stack([cv2.perspectiveTransform(corners, M)[0] for M in H]).astype(float)
+    good = good.copy()
+    T = len(H)
+    for t in range(T):
+        near = [k for k in range(max(0, t - reach), min(T, t + reach + 1)) if k != t and good[k]]
+        if len(near) >= 3 and np.linalg.norm(path[t] - np.median(path[near], axis=0), axis=-1).max() > 3.0:
+            slope = np.abs(np.diff(path[near], axis=0)).max()
+            good[t] &= slope > 3.0  # fast but steady motion is no jump
+    filled = path.copy()
+    known = np.flatnonzero(good)
+    for i in range(4):
+        for j in range(2):
+            filled[:, i, j] = np.interp(np.arange(T), known, path[known, i, j])
+    out = H.copy()
+    for t in np.flatnonzero(~good):
+        out[t] = cv2.getPerspectiveTransform(corners[0], filled[t].astype(np.float32))
+    return out
 
 
 def stabilise(video: Video, scratch: Path | None = None, seed: int = 0) -> tuple[Video, CameraMotion]:

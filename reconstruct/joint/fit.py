@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from reconstruct.joint.bundle import Observations, State, refine, reprojection, 
 from reconstruct.joint.evidence import free_motion, type_probability
 from reconstruct.joint.focal import DEFAULT_FOCAL, estimate_focal
 from reconstruct.joint.models import JointFit
-from reconstruct.joint.select import explained, key_frames, observations, search
+from reconstruct.joint.select import explained, key_frames, motion_stretches, observations, search
 from reconstruct.joint.uncertainty import joint_std
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
@@ -49,59 +49,117 @@ def fit_joint(
     tell = progress or (lambda _: None)
     uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
     h, w = video.frames.shape[1:3]
-    diagonal = float(np.hypot(h, w))
-    extent = np.zeros(len(uv))
-    some = tracks.visible.sum(1) > 1
-    extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
-    moving = np.flatnonzero(extent > MOVING_SHARE * diagonal)
-    if len(moving) < MIN_INLIERS:
-        return JointFit(
-            "refused", f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place", tracks=len(uv)
-        )
     known = focal_px or video.focal_px
     full, focal_std = known or DEFAULT_FOCAL * max(video.size), 0.02
-    focal, centre = full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2])
+    camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
+    found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
+    note = ""
+    if found.refusal and found.scattered:
+        # Several parts may have moved one after the other: look at one stretch of motion at a time.
+        stretches = motion_stretches(uv[_moving(uv, camera)], video.time)
+        tries = [
+            _consensus(_only(uv, span), camera, rng, lambda _: None) for span in stretches[:3] if len(stretches) > 1
+        ]
+        tries = [t for t in tries if not t.refusal]
+        if tries:
+            found = max(tries, key=lambda t: t.explained)
+            note = f"; no joint explains the whole video: the dominant of {len(stretches)} stretches of motion is taken"
+    if found.refusal:
+        return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members),
+                        type_probability=found.probability)  # fmt: skip
+    tell(0.9)
+
+    # Directions that the data hardly hold (an axis towards the camera) converge slowly: finish on the link alone.
+    s, own = found.state, found.link
+    if not known:
+        factor, focal_std = estimate_focal(s, own)
+        full, camera = full * factor, replace(camera, focal=camera.focal * factor)
+        own = replace(own, xy=own.xy / factor, px=own.px / factor)
+    s = refine(s, own, scales=(4.0, 2.0), iterations=60)
+    T = len(video)
+    dense = _all_frames(uv[found.members], camera, own, T)
+    s = replace(s, q=np.interp(np.arange(T), own.frames, s.q))
+    s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
+    std = joint_std(s, dense, focal_std)
+    tell(1.0)
+    return _result(video, s, dense, found.members, full, found.probability, std, len(uv), note)
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """focal: working px.  centre: (2,) working px.  diagonal: of the working frame, px."""
+
+    focal: float
+    centre: np.ndarray
+    diagonal: float
+
+
+@dataclass(frozen=True)
+class _Consensus:
+    """The best joint of both types and the tracks that follow it, or why there is none.
+
+    Attributes:
+        state: with depths of `link`.  link: key-frame observations of the tracks that follow it.
+        members: (n,) indices of these tracks.  probability: of the types.
+        explained: motion of all tracks that it explains.
+        refusal: a sentence, or "".  scattered: True if too few tracks agree on anything.
+    """
+
+    state: State | None = None
+    link: Observations | None = None
+    members: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    probability: dict[str, float] = field(default_factory=dict)
+    explained: float = 0.0
+    refusal: str = ""
+    scattered: bool = False
+
+
+def _moving(uv: np.ndarray, camera: _Camera) -> np.ndarray:
+    """Indices of the tracks that leave their place."""
+    extent = np.zeros(len(uv))
+    some = np.isfinite(uv[..., 0]).sum(1) > 1
+    if some.any():
+        extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
+    return np.flatnonzero(extent > MOVING_SHARE * camera.diagonal)
+
+
+def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:
+    moving = _moving(uv, camera)
+    if len(moving) < MIN_INLIERS:
+        return _Consensus(refusal=f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place")
     keys = key_frames(uv[moving])
     if len(keys) < 6:
-        return JointFit("refused", "the motion is too short: fewer than six distinct states", tracks=len(uv))
+        return _Consensus(refusal="the motion is too short: fewer than six distinct states")
+    focal, centre, diagonal = camera.focal, camera.centre, camera.diagonal
     obs, _ = observations(uv[moving], focal, centre, keys, 260, rng, diagonal)
     if len(obs.ref) < MIN_INLIERS:
-        return JointFit("refused", f"only {len(obs.ref)} moving tracks last long enough", tracks=len(uv))
-    candidates = search(obs, rng, progress=lambda x: tell(0.8 * x))
-    best = {}
-    for s in candidates:
+        return _Consensus(refusal=f"only {len(obs.ref)} moving tracks last long enough")
+    best: dict[str, State] = {}
+    for s in search(obs, rng, progress=lambda x: tell(0.9 * x)):
         best.setdefault(s.kind, s)
+    if not best:
+        return _Consensus(refusal="no tracks move together for long enough to draw a joint", scattered=True)
     probability = type_probability(best, obs)
-    kind = max(probability, key=probability.get)
-    s = best[kind]
-    tell(0.85)
+    s = best[max(probability, key=lambda kind: probability[kind])]
 
     # All moving tracks, not just the sample of the search, for the consensus set.
     every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
     s = refine(_redepth(s, every), every, scales=(3.0, 2.0), iterations=8)
-    link = explained(s, every)[1] > 0.5
-    refusal = _why_refused(s, every, link)
-    if refusal:
-        return JointFit("refused", refusal, tracks=len(uv), inliers=int(link.sum()), type_probability=probability)
-    tell(0.9)
+    total, share = explained(s, every)
+    follows = share > 0.5
+    few = follows.sum() < MIN_INLIERS
+    link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
+                        every.frames)  # fmt: skip
+    return _Consensus(replace(s, depth=s.depth[follows]), link, moving[ids[follows]], probability, total,
+                      _why_refused(s, every, follows) or "", bool(few))  # fmt: skip
 
-    # Directions that the data hardly hold (an axis towards the camera) converge slowly: finish on the link alone.
-    own = Observations(every.xy[link], every.seen[link], every.ref[link], every.weight[link], every.px, every.frames)
-    s = replace(s, depth=s.depth[link])
-    if not known:
-        factor, focal_std = estimate_focal(s, own)
-        full, focal = full * factor, focal * factor
-        own = replace(own, xy=own.xy / factor, px=own.px / factor)
-    s = refine(s, own, scales=(4.0, 2.0), iterations=60)
-    members = moving[ids[link]]
-    T = len(video)
-    dense = _all_frames(uv[members], focal, centre, every, link, T)
-    s = replace(s, q=np.interp(np.arange(T), keys, s.q))
-    s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
-    std = joint_std(s, dense, focal_std)
-    tell(1.0)
-    return _result(video, s, dense, members, full, probability, std, len(uv))
+
+def _only(uv: np.ndarray, span: slice) -> np.ndarray:
+    """Tracks as seen in some frames only."""
+    out = np.full_like(uv, np.nan)
+    out[:, span] = uv[:, span]
+    return out
 
 
 def _redepth(s: State, obs: Observations) -> State:
@@ -122,13 +180,11 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     return None
 
 
-def _all_frames(
-    uv: np.ndarray, focal: float, centre: np.ndarray, keyed: Observations, link: np.ndarray, T: int
-) -> Observations:
+def _all_frames(uv: np.ndarray, camera: _Camera, keyed: Observations, T: int) -> Observations:
+    """Observations of the link's tracks (n, T, 2) in every frame, with the reference frames of the keyed ones."""
     seen = np.isfinite(uv[..., 0])
-    xy = np.where(seen[..., None], (uv - centre) / focal, 0.0)
-    ref = keyed.frames[keyed.ref[link]]
-    return Observations(xy, seen, ref, keyed.weight[link], 1.0 / focal, np.arange(T))
+    xy = np.where(seen[..., None], (uv - camera.centre) / camera.focal, 0.0)
+    return Observations(xy, seen, keyed.frames[keyed.ref], keyed.weight, 1.0 / camera.focal, np.arange(T))
 
 
 def _result(
@@ -140,6 +196,7 @@ def _result(
     probability: dict[str, float],
     std: dict,
     tracks: int,
+    note: str,
 ) -> JointFit:
     """World frame, signs, units and the contract's fields."""
     X, _ = transport(s, obs)
@@ -174,11 +231,13 @@ def _result(
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     K = np.array([[full_focal, 0, (video.size[0] - 1) / 2], [0, full_focal, (video.size[1] - 1) / 2], [0, 0, 1.0]])
     p = max(probability.values())
-    verdict, reason = "ok", f"{len(members)} tracks agree; {how}"
+    verdict, reason = "ok", f"{len(members)} tracks agree; {how}{note}"
     if p < 0.9:
         verdict = "ambiguous"
         names = " and ".join(sorted(probability, key=probability.get, reverse=True))
-        reason = f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}"
+        reason = (
+            f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}{note}"
+        )
     std = dict(std, point_m=std["point"] / unit, q=std["q"] / (unit if s.kind == "prismatic" else 1.0))
     std.pop("point")
     fit = JointFit(

@@ -14,14 +14,52 @@ SCORE_PX = 3.0
 """Scale of the robust score, working px."""
 
 
-def key_frames(uv: np.ndarray, count: int = 28) -> np.ndarray:
-    """(K,) frames spread evenly over the accumulated motion of moving tracks (N, T, 2), ends included."""
-    T = uv.shape[1]
+def image_speed(uv: np.ndarray) -> np.ndarray:
+    """(T - 1,) upper image speed of moving tracks (N, T, 2), px a frame; zero where too few are seen."""
     step = np.linalg.norm(np.diff(uv, axis=1), axis=-1)
     seen = np.isfinite(step)
-    speed = np.array([np.quantile(step[seen[:, t], t], 0.9) if seen[:, t].sum() > 3 else 0.0 for t in range(T - 1)])
+    return np.array(
+        [np.quantile(step[seen[:, t], t], 0.9) if seen[:, t].sum() > 3 else 0.0 for t in range(step.shape[1])]
+    )
+
+
+def key_frames(uv: np.ndarray, count: int = 28) -> np.ndarray:
+    """(K,) frames spread evenly over the accumulated motion of moving tracks (N, T, 2).
+
+    First and last frame in which anything is seen are among them.
+    """
+    anything = np.flatnonzero(np.isfinite(uv[..., 0]).any(0))
+    if not len(anything):
+        return anything
+    first, last = anything[0], anything[-1]
+    speed = image_speed(uv[:, first : last + 1])
+    if not len(speed):
+        return anything[:1]
     total = np.concatenate([[0], np.cumsum(speed + 0.03 * speed.max() + 1e-9)])
-    return np.unique(np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, T - 1))
+    return first + np.unique(np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, last - first))
+
+
+def motion_stretches(uv: np.ndarray, time: np.ndarray, gap: float = 0.4, shortest: float = 0.25) -> list[slice]:
+    """Stretches of motion between rests, the one with most motion first.
+
+    Args:
+        uv: (N, T, 2) moving tracks.  time: (T,) s.
+        gap: rests shorter than this do not divide, s.  shortest: shorter stretches are dropped, s.
+    """
+    speed = image_speed(uv)
+    speed = np.convolve(speed, np.ones(5) / 5, mode="same")
+    active = np.flatnonzero(speed > 0.25 * np.quantile(speed, 0.97))
+    if not len(active):
+        return []
+    breaks = np.flatnonzero(np.diff(time[active]) > gap)
+    out = []
+    for part in np.split(active, breaks + 1):
+        if time[part[-1] + 1] - time[part[0]] >= shortest:
+            # The rests beside it show where the part starts and ends.
+            lo = np.searchsorted(time, time[part[0]] - 0.5 * gap)
+            hi = np.searchsorted(time, time[part[-1] + 1] + 0.5 * gap)
+            out.append((float(speed[part].sum()), slice(int(lo), int(hi))))
+    return [span for _, span in sorted(out, key=lambda x: -x[0])]
 
 
 def observations(
