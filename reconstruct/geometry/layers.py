@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruct.cues import Hands
+from reconstruct.cues import Hands, Tracks
 from reconstruct.geometry.plane import LinkPlane, apply_homography, homography, working_matrix
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
@@ -112,10 +112,50 @@ class Evidence:
     frames: np.ndarray
 
 
-def spread_frames(fit: JointFit, hand_mask: np.ndarray, count: int) -> np.ndarray:
-    """Up to ``count`` frames evenly spread over q; of the frames of one bin the one with the fewest hand pixels."""
+def frame_costs(video: Video, tracks: Tracks, fit: JointFit, hand_mask: np.ndarray) -> np.ndarray:
+    """(T,) how little each frame shows of the link: 0 if all of it, as the joint says; up to about 2.
+
+    Counted are the share of the link's own area that hands cover (a hand elsewhere in the picture does no
+    harm) and, with 1, frames in which the tracks contradict the joint or none is left to support it (the
+    object may have been carried off).
+
+    Args:
+        hand_mask: (T, h, w) bool at working size.
+    """
+    import cv2
+
+    step = 4
+    small = hand_mask[:, ::step, ::step]
+    h, w = small.shape[1:]
+    idx = np.asarray(fit.point_track, int)
+    pose = fit.link_pose(fit.q)
+    points = np.asarray(fit.points)
+    uv = fit.project(np.einsum("tij,nj->nti", pose[:, :3, :3], points) + pose[:, :3, 3])
+    miss = np.where(tracks.visible[idx], np.linalg.norm(uv - tracks.uv[idx], axis=-1), np.nan)
+    count = np.isfinite(miss).sum(0)
+    middle = np.array([np.nanmedian(m) if c else np.inf for m, c in zip(miss.T, count, strict=True)])
+    usual = float(np.median(middle[count > 0])) if (count > 0).any() else 0.0
+    strange = (count < 3) | (middle > max(4 * usual, 0.004 * video.diagonal))
+    # Points off the bulk would blow the outline up: keep nine tenths about their median.
+    far = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    kept = far <= np.quantile(far, 0.9)
+    hidden = np.zeros(len(fit.q))
+    area = np.zeros((h, w), np.uint8)
+    for t in range(len(hidden)):
+        area[:] = 0
+        px = np.nan_to_num(video.to_work(uv[kept, t]), nan=-9999.0).clip(-9999, 9999) / step
+        cv2.fillConvexPoly(area, cv2.convexHull(np.round(px).astype(np.int32)), 1)
+        hidden[t] = small[t][area > 0].mean() if area.any() else 1.0
+    return hidden + strange
+
+
+def spread_frames(fit: JointFit, costs: np.ndarray, count: int) -> np.ndarray:
+    """Up to ``count`` frames evenly spread over q; of the frames of one bin the one that shows the link best.
+
+    Args:
+        costs: (T,) from :func:`frame_costs`.
+    """
     q = np.asarray(fit.q, float)
-    covered = hand_mask[:, ::4, ::4].reshape(len(q), -1).mean(1)
     edges = np.linspace(q.min(), q.max(), count + 1)
     which = np.clip(np.searchsorted(edges, q, side="right") - 1, 0, count - 1)
     picks = []
@@ -123,7 +163,7 @@ def spread_frames(fit: JointFit, hand_mask: np.ndarray, count: int) -> np.ndarra
         members = np.flatnonzero(which == b)
         if len(members):
             middle = np.abs(q[members] - (edges[b] + edges[b + 1]) / 2) / max(edges[1] - edges[0], 1e-12)
-            picks.append(members[np.argmin(covered[members] * 10 + middle)])
+            picks.append(members[np.argmin(costs[members] * 10 + middle)])
     return np.asarray(sorted(set(int(p) for p in picks)))
 
 
@@ -189,7 +229,7 @@ def to_lab(image: np.ndarray) -> np.ndarray:
     return lab
 
 
-def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: int = 24,
+def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, costs: np.ndarray, count: int = 24,
            rounds: int = 2) -> Evidence:
     """Which cells of the link's plane are link.
 
@@ -198,6 +238,7 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
         hands: their pixels count as unknown.
         fit: the joint.
         plane: from :func:`reconstruct.geometry.plane.fit_plane`.
+        costs: (T,) from :func:`frame_costs`.
         count: frames to look at.
         rounds: times that the background is learned anew with the link's better outline excluded.
     """
@@ -206,7 +247,7 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, count: i
     window = make_window(video, fit, plane)
     size = window.size
     S = window.matrix(video)
-    frames = spread_frames(fit, hands.mask, count)
+    frames = spread_frames(fit, costs, count)
     seed_outline = seed_polygon(fit, plane)
     chart = make_chart(seed_outline)
     seed = fill(chart, seed_outline)

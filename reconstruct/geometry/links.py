@@ -9,12 +9,13 @@ import numpy as np
 from reconstruct.cues import Hands, LinkMasks, Tracks
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
+from reconstruct.geometry.block import place_block
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
-from reconstruct.geometry.layers import make_window, spread_frames, to_lab
+from reconstruct.geometry.layers import frame_costs, spread_frames
 from reconstruct.geometry.masks import points_on_mask
-from reconstruct.geometry.outline import Shape, build_shape
-from reconstruct.geometry.plane import LinkPlane, fit_plane, keep_points
-from reconstruct.geometry.solids import carve, extrude, hull, static_box, swept_hulls, to_arrays
+from reconstruct.geometry.outline import build_shape
+from reconstruct.geometry.plane import fit_plane, keep_points
+from reconstruct.geometry.solids import carve, extrude, hull, swept_hulls, to_arrays
 from reconstruct.geometry.texture import paint, subdivide
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
@@ -50,18 +51,20 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
     if not good.all():
         notes.append(f"{int((~good).sum())} of {len(good)} fitted points lie off the moving silhouette; left out")
         fit, plane = keep_points(fit, plane, good)
-    shape = build_shape(video, hands, fit, plane, masks)
+    costs = frame_costs(video, tracks, fit, masks.hand)
+    shape = build_shape(video, hands, fit, plane, masks, costs)
     solid = extrude(shape, plane)
     vertices, faces = to_arrays(solid)
     extent = float(np.linalg.norm(shape.bounds[1] - shape.bounds[0]))
     clearance = CLEARANCE * extent
     parts, convexity = convex_parts(vertices, faces)
 
-    end, likeness, decided = closed_end(video, fit, plane, shape, masks, clearance)
+    surface, _ = subdivide(vertices, faces, 800)
+    block = place_block(video, fit, plane, shape, masks, costs, surface, clearance)
     clouds = swept_hulls(parts, fit, clearance)
     if hand_points is not None:
         clouds = clouds + _hand_clouds(np.asarray(hand_points, float), clearance)
-    box, about = static_box(shape, plane, fit, end, clearance)
+    box = block.solid
     body = carve(box, clouds)
     # A block that loses little when cut back by planes alone stays convex: simpler to simulate and to believe.
     plain = trim_parts((to_arrays(box),), clouds)
@@ -79,12 +82,14 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
     if verdict["contacts"]:
         notes.append(f"the links touch in {verdict['contacts']} contacts over the joint's range")
 
-    moving = _finish(video, fit, masks, vertices, faces, parts, True, [])
-    static = _finish(video, fit, masks, s_vertices, s_faces, s_parts, False,
-                     [(moving.vertices, moving.faces, True)])
+    moving = _finish(video, fit, masks, costs, vertices, faces, parts, True, [])
+    static = _finish(video, fit, masks, costs, s_vertices, s_faces, s_parts, False,
+                     [(moving.vertices, moving.faces, True)], block.seen)
     inertia = mass_properties(vertices, faces)
-    notes.append("the static link's size and sides were not seen: it is a block behind the moving part's closed pose")
-    if not decided:
+    words = "a block behind the moving part's closed pose"
+    words += ", cut to the body's outline in the picture" if block.seen is not None else ""
+    notes.append(f"the static link's depth and sides were not seen: it is {words}")
+    if not block.decided:
         notes.append("which end of the motion is closed is not clear from the pixels; the likelier was taken")
     if shape.thickness_origin == "assumed":
         notes.append("the moving link's thickness is assumed")
@@ -107,8 +112,10 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         "moving_com": entry(inertia["com"].tolist(), "assumed", unit=unit),
         "moving_inertia": entry(inertia["inertia"].tolist(), "assumed", unit="kg m2"),
         "moving_parts": entry(convexity["parts"], "fitted", **{k: v for k, v in convexity.items() if k != "parts"}),
-        "static_depth": entry(about["depth"], "assumed", unit=unit),
-        "static_closed_at": entry(end, "fitted" if decided else "assumed", unit=fit.unit, likeness=likeness),
+        "static_depth": entry(block.depth, "assumed", unit=unit),
+        "static_closed_at": entry(block.end, "fitted" if block.decided else "assumed", unit=fit.unit,
+                                  likeness=block.scores),
+        "static_outline": entry(block.seen is not None, "fitted" if block.seen is not None else "assumed"),
         "static_volume_kept": entry(left, "assumed"),
         "static_parts": entry(len(s_parts), "fitted", **{k: v for k, v in s_convexity.items() if k != "parts"}),
         "clearance": entry(clearance, "assumed", unit=unit),
@@ -129,90 +136,22 @@ def _hand_clouds(points: np.ndarray, clearance: float, count: int = 16) -> list[
     return [(p[:, None] + around).reshape(-1, 3) for p in pick]
 
 
-def closed_end(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, masks: LinkMasks,
-               clearance: float) -> tuple[float, dict, bool]:
-    """Which end of the range is the closed one: there the body lies right behind the link.
-
-    A body and its door, lid or arm are mostly of one make, while floors and walls are not, and a hand does
-    not reach through a body: the block assumed at each end is drawn into the image, its colours are compared
-    with the link's, and the share of it that hands cover counts against it.
-
-    Returns:
-        The state, {"start", "other"} likenesses in [0, 1], and whether they differ enough to decide.
-    """
-    import cv2
-
-    ends = [float(fit.q.min()), float(fit.q.max())]
-    frames = spread_frames(fit, masks.hand, 12)
-    window = make_window(video, fit, plane)
-    size, S = window.size, window.matrix(video)
-    images = np.stack([to_lab(window.crop(video.frames[t])) for t in frames])
-    kernel = np.ones((5, 5), np.uint8)
-    link = np.stack([window.crop(masks.moving[t]) for t in frames])
-    hand = np.stack([window.crop(masks.hand[t]) for t in frames])
-    free = ~np.stack([cv2.dilate(window.crop(masks.moving[t] | masks.hand[t]).astype(np.uint8), kernel) > 0
-                      for t in frames])
-    mean = _histogram(images[link])
-    path = shape_silhouette(shape, plane, fit, ends, S, size)
-    scores = []
-    for end in ends:
-        box, _ = static_box(shape, plane, fit, end, clearance)
-        corners, _ = to_arrays(box)
-        uv = fit.project(corners)
-        uv = np.concatenate([uv, np.ones((len(uv), 1))], 1) @ S.T
-        region = np.zeros((size[1], size[0]), np.uint8)
-        cv2.fillConvexPoly(region, cv2.convexHull(np.round(uv[:, :2]).clip(-9999, 9999).astype(np.int32)), 1)
-        # Leave out the hollow behind the closed link: only it and the moving part were ever there.
-        here = (region > 0) & ~path
-        pixels = np.concatenate([images[k][here & free[k]] for k in range(len(frames))])
-        likeness = float(np.minimum(_histogram(pixels), mean).sum()) if len(pixels) > 50 else 0.0
-        reached = float(hand[:, here].mean()) if here.any() else 0.0
-        scores.append(likeness * (1 - min(1.0, 2 * reached)))
-    first = int(np.argmin(np.abs(np.array(ends) - fit.q[0])))
-    likeness = {"start": scores[first], "other": scores[1 - first]}
-    chosen = first if scores[first] >= scores[1 - first] else 1 - first
-    return ends[chosen], likeness, scores[chosen] > 1.3 * scores[1 - chosen] + 0.02
-
-
-def shape_silhouette(shape: Shape, plane: LinkPlane, fit: JointFit, states: list[float], S: np.ndarray,
-                     size: tuple[int, int]) -> np.ndarray:
-    """(h, w) bool: pixels that the link's bounding block covers at any of the states."""
-    import cv2
-
-    low, high = shape.bounds
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    world = plane.to_world(corners)
-    out = np.zeros((size[1], size[0]), np.uint8)
-    for q in states:
-        T = fit.link_pose(q)
-        uv = fit.project(world @ T[:3, :3].T + T[:3, 3])
-        uv = np.concatenate([uv, np.ones((len(uv), 1))], 1) @ S.T
-        cv2.fillConvexPoly(out, cv2.convexHull(np.round(uv[:, :2]).clip(-9999, 9999).astype(np.int32)), 1)
-    return out > 0
-
-
-def _histogram(lab: np.ndarray) -> np.ndarray:
-    """Normalised colour histogram of (n, 3) pixels, blurred over neighbouring bins."""
-    from scipy.ndimage import gaussian_filter
-
-    count, _ = np.histogramdd(lab, bins=(10, 16, 16), range=((0, 160), (64, 192), (64, 192)))
-    count = gaussian_filter(count, 0.7)
-    return count / max(count.sum(), 1e-12)
-
-
-def _finish(video: Video, fit: JointFit, masks: LinkMasks, vertices: np.ndarray, faces: np.ndarray,
-            parts: tuple, moves: bool, others: list) -> LinkMesh:
-    """Subdivide and colour one link."""
+def _finish(video: Video, fit: JointFit, masks: LinkMasks, costs: np.ndarray, vertices: np.ndarray,
+            faces: np.ndarray, parts: tuple, moves: bool, others: list, within: np.ndarray | None = None) -> LinkMesh:
+    """Subdivide and colour one link; ``within`` (any size) bounds the pixels that may colour it."""
     import cv2
 
     fine_v, fine_f = subdivide(vertices, faces)
-    frames = spread_frames(fit, masks.hand, 14)
+    frames = spread_frames(fit, costs, 14)
     if moves:
         allowed = np.stack([cv2.erode(masks.moving[t].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
                             for t in frames])
     else:
         covered = np.stack([masks.moving[t] | masks.hand[t] for t in frames])
         allowed = ~np.stack([cv2.dilate(c.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0 for c in covered])
+        if within is not None:
+            h, w = masks.moving.shape[1:]
+            allowed &= cv2.resize(within.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)[None] > 0
     colors, seen = paint(video, fit, fine_v, fine_f, frames, allowed, moves, [(vertices, faces, moves), *others])
     # Colours on the static block are a projection of what stands there; its surface itself stays assumed.
     assumed = ~seen[fine_f].all(1) if moves else np.ones(len(fine_f), bool)

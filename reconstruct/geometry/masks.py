@@ -9,6 +9,7 @@ from reconstruct.geometry.layers import (
     Evidence,
     background_residual,
     contradicted,
+    frame_costs,
     gather,
     level_exposure,
     make_window,
@@ -46,12 +47,13 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
 
     T, h, w = video.frames.shape[:3]
     plane = fit_plane(tracks, fit)
-    evidence = gather(video, hands, fit, plane)
+    costs = frame_costs(video, tracks, fit, hands.mask)
+    evidence = gather(video, hands, fit, plane, costs)
     stray = contradicted(evidence, fit, plane)
     if 0.05 * len(stray) < stray.sum() <= len(stray) - 5:
         fit, plane = keep_points(fit, plane, ~stray)
-        evidence = gather(video, hands, fit, plane)
-    keys = spread_frames(fit, hands.mask, KEY_FRAMES)
+        evidence = gather(video, hands, fit, plane, costs)
+    keys = spread_frames(fit, costs, KEY_FRAMES)
     cut, agreement = _cut_keys(video, hands, fit, plane, evidence, keys)
 
     S = working_matrix(video)

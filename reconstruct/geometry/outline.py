@@ -10,13 +10,13 @@ from shapely.ops import unary_union
 
 from reconstruct.cues import Hands, LinkMasks
 from reconstruct.geometry.layers import Chart, make_chart, make_window, seed_polygon, spread_frames
+from reconstruct.geometry.masks import KEY_FRAMES
 from reconstruct.geometry.plane import LinkPlane, apply_homography, homography
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
 SIZE = 240
 """Silhouettes are compared at this long side, px."""
-VIEWS = 14
 TIPS = (4, 8, 12, 16, 20)
 RATIOS = (0.0, 0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.13, 0.18, 0.25, 0.35)
 """Offsets from the plane that are tried, in parts of the link's extent."""
@@ -69,11 +69,12 @@ class Shape:
         return np.stack([low, np.r_[b[:, 2:].max(0), max(s.high for s in self.slices)]])
 
 
-def make_views(video: Video, fit: JointFit, plane: LinkPlane, masks: LinkMasks, count: int = VIEWS) -> Views:
-    """Shrunk silhouettes of frames spread over q."""
+def make_views(video: Video, fit: JointFit, plane: LinkPlane, masks: LinkMasks, costs: np.ndarray,
+               count: int = KEY_FRAMES) -> Views:
+    """Shrunk silhouettes of frames spread over q: as many as were cut at pixel level, hence the same ones."""
     import cv2
 
-    frames = spread_frames(fit, masks.hand, count)
+    frames = spread_frames(fit, costs, count)
     window = make_window(video, fit, plane, SIZE)
     mask = np.stack([window.crop(masks.moving[t]) for t in frames])
     hand = np.stack([cv2.dilate(window.crop(masks.hand[t]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -104,6 +105,19 @@ def vote(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, offset: fl
         inside += w * m * known
         total += w * known
     return np.where(total > 0, inside / np.maximum(total, 1e-12), 0.0), total
+
+
+def fill_unseen(cells: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """Cells that no frame shows (a hand or the picture's border hides them) are link where they lie between link
+    cells, in their convex hull: what is hidden is unknown, not absent."""
+    import cv2
+
+    spots = np.argwhere(cells)[:, ::-1]
+    if len(spots) < 3 or not unseen.any():
+        return cells
+    around = np.zeros(cells.shape, np.uint8)
+    cv2.fillConvexPoly(around, cv2.convexHull(spots.astype(np.int32)), 1)
+    return cells | (unseen & (around > 0))
 
 
 def trace(chart: Chart, cells: np.ndarray, smooth: float) -> Polygon | MultiPolygon:
@@ -230,13 +244,18 @@ def hold_points(hands: Hands, fit: JointFit, plane: LinkPlane) -> np.ndarray:
     return best[1] if best is not None else np.empty((0, 2))
 
 
-def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, masks: LinkMasks) -> Shape:
-    """Outline and thickness of the moving link from its silhouettes."""
-    views = make_views(video, fit, plane, masks)
+def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, masks: LinkMasks,
+                costs: np.ndarray) -> Shape:
+    """Outline and thickness of the moving link from its silhouettes.
+
+    Args:
+        costs: (T,) from :func:`reconstruct.geometry.layers.frame_costs`.
+    """
+    views = make_views(video, fit, plane, masks, costs)
     seed = seed_polygon(fit, plane)
     chart = make_chart(seed)
     share, total = vote(views, fit, plane, chart)
-    cells = (share > 0.5) & (total > 0.05 * total.max())
+    cells = fill_unseen((share > 0.5) & (total > 0.05 * total.max()), total <= 0.05 * total.max())
     outline = trace(chart, cells, 0.018 * plane.extent)
     if outline.is_empty:
         outline = Polygon(seed)

@@ -126,12 +126,16 @@ def closing_direction(fit: JointFit, centre: np.ndarray, end: float) -> np.ndarr
     return move / length if length > 0 else fit.axis
 
 
-def static_box(shape: Shape, plane: LinkPlane, fit: JointFit, end: float, clearance: float) -> tuple[Manifold, dict]:
+def static_box(shape: Shape, plane: LinkPlane, fit: JointFit, end: float, clearance: float,
+               widen: float = 0.0) -> tuple[Manifold, dict]:
     """The assumed static body: what the link closes onto at state ``end``, as a block behind it.
 
     The block has the link's outline box across the closing direction and, along it, a depth in
     proportion: nothing in a still camera's view measures it. It reaches the hinge line where that lies
     close by.
+
+    Args:
+        widen: how much more room to give it across, on every side, in parts of the link's longest side.
     """
     pose = fit.link_pose(end) @ plane.pose
     low, high = shape.bounds
@@ -146,7 +150,7 @@ def static_box(shape: Shape, plane: LinkPlane, fit: JointFit, end: float, cleara
     if fit.type == "prismatic":
         depth = max(depth, 1.15 * float(np.ptp(fit.q)))
     box_low, box_high = low.copy(), high.copy()
-    grow = 0.02 * float(np.linalg.norm(size)) + 2 * clearance
+    grow = 0.02 * float(np.linalg.norm(size)) + 2 * clearance + widen * float(size.max())
     for j in range(3):
         if j != k:
             box_low[j] -= grow
