@@ -150,6 +150,48 @@ class Score(Common):
 
 
 @dataclass(kw_only=True)
+class Train(Common):
+    """Train a policy with Stable-Baselines3; a run that was killed goes on where it was."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+    algo: Literal["ppo", "sac"] = "ppo"
+    """Algorithm; its settings are in train/configs."""
+    steps: int | None = None
+    """Environment steps in all (default: as the settings say)."""
+    envs: int | None = None
+    """Simulations at once (default: as the settings say)."""
+    config: Path | None = None
+    """TOML file of settings in place of the shipped one."""
+    out: Path | None = None
+    """Folder of the run (default: runs/<id>-<algo>-<seed>)."""
+    seed: int = 0
+    """Seed of everything that draws."""
+
+    def run(self) -> Outcome:
+        return commands.train(self.id, self.algo, self.steps, self.envs, self.config, self.out, self.seed)
+
+
+@dataclass(kw_only=True)
+class Evaluate(Common):
+    """Compare a policy with the open-loop replay in the same randomised episodes."""
+
+    id: tyro.conf.Positional[str]
+    """Id of an asset."""
+    policy: tyro.conf.Positional[Path]
+    """policy.pt of `taa train`, or its run's folder."""
+    episodes: int = 100
+    """How many."""
+    video: Path | None = None
+    """MP4 file to write: three episodes, the policy beside the replay."""
+    seed: int = 1_000_000
+    """Seed of the first episode; the others follow it."""
+
+    def run(self) -> Outcome:
+        return commands.evaluate(self.id, self.policy, self.episodes, self.seed, self.video)
+
+
+@dataclass(kw_only=True)
 class Export(Common):
     """Write an asset as a self-contained folder for other programs."""
 
@@ -202,6 +244,8 @@ Command = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Score, tyro.conf.subcommand("score")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]

@@ -280,6 +280,64 @@ def doctor(rendering: bool) -> Outcome:
     return Outcome(data, words)
 
 
+def train(asset_id: str, algo: str, steps: int | None, envs: int | None, config: Path | None, out: Path | None,
+          seed: int) -> Outcome:  # fmt: skip
+    from taa_envs import registry
+
+    asset = registry.get_asset(asset_id)
+    from train.config import load_config
+    from train.run import train as run
+
+    settings = load_config(algo, config, steps=steps, envs=envs, seed=seed)
+    folder = out if out is not None else Path("runs") / f"{asset.id}-{algo}-{seed}"
+    with StageBars() as bars:
+        begin = time.monotonic()
+        bars.start(algo)
+        last = {}
+
+        def progress(share: float, row: dict) -> None:
+            last.update(row)
+            bars.update(share)
+
+        data = run(asset, settings, folder, progress=progress)
+        known = last and np.isfinite(last["success"])
+        bars.finish(time.monotonic() - begin, f"success {last['success']:.0%} with exploration" if known else "")
+
+    def words() -> None:
+        if data["resumed_at"]:
+            print(f"went on from {data['resumed_at']} steps")
+        print(f"policy  {data['policy']}")
+        print(f"curve   {Path(data['run']) / 'curve.csv'}")
+        print(f"use     taa evaluate {asset.id} {data['policy']}")
+
+    return Outcome(data, words)
+
+
+def evaluate(asset_id: str, policy: Path, episodes: int, seed: int, video: Path | None) -> Outcome:
+    from taa_envs import registry
+
+    asset = registry.get_asset(asset_id)
+    if video is not None and not video.parent.is_dir():
+        raise TaaEnvsError(f"no such folder: {video.parent}; make it first")
+    from train.evaluate import evaluate as run
+    from train.evaluate import record
+
+    data = run(asset, policy, episodes, seed=seed)
+    if video is not None:
+        record(asset, policy, video, seed=seed)
+
+    def words() -> None:
+        rows = [(name, f"{data[key]['success']:.0%}", "{:.0%} to {:.0%}".format(*data[key]["success_ci95"]),
+                 f"{data[key]['joint_progress']:.0%}")
+                for name, key in ((f"{data['algo']} policy", "policy"), ("open-loop replay", "replay"))]  # fmt: skip
+        _table(f"{asset.id}: {episodes} episodes under the asset's own randomisation",
+               [("", "success", "95 % interval", "joint progress"), *rows], header=True)  # fmt: skip
+        if video is not None:
+            print(f"video   {video}")
+
+    return Outcome(data, words)
+
+
 def replay_rows(result: dict) -> list[tuple[str, str]]:
     """The result table of a replay or a score; rows for the keys that are there."""
     names = {"joint_progress": "joint progress", "final_q_error": "final q error", "max_progress": "max progress",

@@ -80,8 +80,8 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
 
     ``action="absolute"``: ``Box(-1, 1, (63,), float32)``, where the 21 landmarks are to be, relative to the
     demonstration's first frame, in units of ``reach`` (1.25 times the farthest the demonstrated hand goes along an
-    axis, at least 0.1 m). The zero action holds the hand where the demonstration began. Targets move at most at 2 m/s (or
-    1.5 times the demonstration's fastest). :meth:`reference_action` is the action that follows the demonstration.
+    axis, at least 0.1 m). The zero action holds the hand where the demonstration began. Targets move at most at 2 m/s
+    (or 1.5 times the demonstration's fastest). :meth:`reference_action` is the action that follows the demonstration.
 
     ## Observations
     ``observation="flat"`` (default): ``Box(-10, 10, (153,), float32)`` (209 with absolute actions), clipped;

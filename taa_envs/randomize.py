@@ -2,8 +2,8 @@
 
 Every amount comes from the asset: the ``std`` of the entry of that name in its provenance. Nothing is drawn for a
 number that has none, but for the assumed forces and masses: a video carries no force, the asset says ``assumed``, and
-an assumption is taken to hold within a factor of two (:data:`ASSUMED_FACTOR`, one standard deviation), the one number here
-that no asset gives.
+an assumption is taken to hold within a factor of two (:data:`ASSUMED_FACTOR`, one standard deviation), the one
+number here that no asset gives.
 
 ==============  ======================================  ================================================================
 name            standard deviation                      what is drawn

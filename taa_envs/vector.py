@@ -32,8 +32,8 @@ class BatchedArticulationEnv(VectorEnv):
         max_episode_steps: after which an episode is truncated; default the registered limit.
         autoreset_mode: "next_step" (default: the step after an episode's last ignores its action and starts the next
             one, as ``SyncVectorEnv`` does), "same_step" (the last observation and info are then in
-            ``info["final_obs"]`` and ``info["final_info"]``) or "disabled" (``reset(options={"reset_mask": (n,) bool})``
-            starts those of the mask).
+            ``info["final_obs"]`` and ``info["final_info"]``) or "disabled"
+            (``reset(options={"reset_mask": mask})`` starts those of the (n,) bool mask).
         threads: of the pool; 0 for one a CPU.
 
     Rendering is left to the single environment.

@@ -1,0 +1,143 @@
+"""Training, resuming, policies on disk, evaluation."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from taa_envs.asset import Asset
+from taa_envs.errors import TaaEnvsError
+from taa_envs.vector import BatchedArticulationEnv
+from train.config import Config, load_config
+from train.evaluate import episodes, evaluate, record
+from train.policy import load_policy
+from train.run import train
+from train.vec import BatchedVecEnv
+
+PPO = Config(algo="ppo", envs=2, steps=512, checkpoint_every=128, algorithm={"n_steps": 64, "batch_size": 64,
+             "n_epochs": 2}, policy={"net_arch": [16]})
+SAC = Config(algo="sac", envs=2, steps=300, checkpoint_every=100, algorithm={"buffer_size": 500, "learning_starts": 50,
+             "batch_size": 16, "gradient_steps": 1}, policy={"net_arch": [16]})
+
+
+class Killed(Exception):
+    pass
+
+
+def curve(folder: Path) -> list[list[str]]:
+    """Without the column of seconds."""
+    with (folder / "curve.csv").open(newline="", encoding="utf-8") as f:
+        return [row[:-1] for row in csv.reader(f)]
+
+
+@pytest.mark.parametrize("config", [PPO, SAC], ids=["ppo", "sac"])
+def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp_path: Path,
+                                                monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("train.run.CHUNK", 100)
+    whole = train(door, config, tmp_path / "whole")
+    assert whole["resumed_at"] == 0 and whole["steps"] >= config.steps
+
+    def kill(share: float, row: dict) -> None:
+        if row["steps"] >= config.steps // 2 + 50:  # between two checkpoints
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(door, config, tmp_path / "killed", progress=kill)
+    np.random.default_rng(0).random(3), torch.rand(5)  # other generators' states do not matter
+    again = train(door, config, tmp_path / "killed")
+    assert 0 < again["resumed_at"] < config.steps
+    assert curve(tmp_path / "killed") == curve(tmp_path / "whole") and len(curve(tmp_path / "whole")) > 3
+    a, b = (load_policy(tmp_path / name)[0].state_dict() for name in ("whole", "killed"))
+    assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_a_folder_holds_one_run(door: Asset, tmp_path: Path) -> None:
+    small = Config(**{**PPO.as_dict(), "steps": 128})
+    train(door, small, tmp_path / "run")
+    done = train(door, small, tmp_path / "run")
+    assert done["resumed_at"] == done["steps"] == 128  # nothing left to do
+    with pytest.raises(TaaEnvsError, match="other settings"):
+        train(door, Config(**{**small.as_dict(), "seed": 1}), tmp_path / "run")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("x")
+    with pytest.raises(TaaEnvsError, match="not a training run"):
+        train(door, small, tmp_path / "mine")
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_the_policy_loads_in_a_fresh_process(door: Asset, tmp_path: Path) -> None:
+    train(door, Config(**{**PPO.as_dict(), "steps": 128}), tmp_path / "run")
+    here = evaluate(door, tmp_path / "run", 3)
+    code = ("import sys, json; from taa_envs import load_asset; from train.evaluate import evaluate\n"
+            "print(json.dumps(evaluate(load_asset(sys.argv[1]), sys.argv[2], 3)))")
+    out = subprocess.run([sys.executable, "-c", code, str(door.path), str(tmp_path / "run" / "policy.pt")], check=True,
+                         capture_output=True, text=True, timeout=120,
+                         env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])})
+    assert json.loads(out.stdout.splitlines()[-1]) == here
+    assert here["episodes"] == 3 and here["replay"]["success_ci95"][0] <= here["replay"]["success"]
+
+
+def test_replay_in_the_evaluation_is_the_replay(door: Asset) -> None:
+    run = episodes(door, None, 2, randomize=False)
+    assert run["success"].all() and (run["progress"] >= 0.95).all() and run["steps"][0] == run["steps"][1]
+    same = episodes(door, None, 3, seed=5)
+    np.testing.assert_array_equal(same["progress"][1:], episodes(door, None, 2, seed=6)["progress"])
+
+
+def test_bad_policies_are_refused(door: Asset, tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> tuple:
+            return os.mkdir, (str(tmp_path / "ran"),)
+
+    (tmp_path / "evil.pt").write_bytes(pickle.dumps(Evil()))
+    torch.save({"format": "taa-policy/1", "x": Evil()}, tmp_path / "evil2.pt")
+    torch.save({"format": "other"}, tmp_path / "other.pt")
+    torch.save({"format": "taa-policy/1"}, tmp_path / "empty.pt")
+    for name in ("evil.pt", "evil2.pt", "other.pt", "empty.pt", "none.pt"):
+        with pytest.raises(TaaEnvsError):
+            evaluate(door, tmp_path / name, 1)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_settings_come_from_files(tmp_path: Path) -> None:
+    for algo in ("ppo", "sac"):
+        assert load_config(algo).algo == algo and load_config(algo, steps=7, seed=3).steps == 7
+    with pytest.raises(TaaEnvsError, match="known: ppo, sac"):
+        load_config("dqn")
+    for text in ("steps = ", "envs = 0\nsteps = 1\ncheckpoint_every = 1", "speed = 3"):
+        (tmp_path / "c.toml").write_text(text)
+        with pytest.raises(TaaEnvsError):
+            load_config("ppo", tmp_path / "c.toml")
+
+
+def test_vec_env_as_stable_baselines_wants_it(door: Asset) -> None:
+    with pytest.raises(ValueError, match="same_step"):
+        BatchedVecEnv(BatchedArticulationEnv(door, 2))
+    env = BatchedVecEnv(BatchedArticulationEnv(door, 2, autoreset_mode="same_step", max_episode_steps=5, threads=1))
+    env.seed(3)
+    first = env.reset()
+    total = 0.0
+    for step in range(5):
+        seen, reward, done, infos = env.step(np.zeros((2, 7), np.float32))
+        total += reward[0]
+        assert done.all() == (step == 4)
+    assert infos[0]["TimeLimit.truncated"] and infos[0]["episode"]["r"] == pytest.approx(total, abs=1e-6)
+    assert infos[0]["episode"]["l"] == 5
+    np.testing.assert_array_equal(seen, first)  # the unperturbed start
+    assert not np.array_equal(infos[0]["terminal_observation"], first[0])
+
+
+@pytest.mark.slow
+def test_video(door: Asset, tmp_path: Path) -> None:
+    train(door, Config(**{**PPO.as_dict(), "steps": 128}), tmp_path / "run")
+    record(door, tmp_path / "run", tmp_path / "a.mp4", count=1, height=96)
+    assert (tmp_path / "a.mp4").stat().st_size > 5000

@@ -1,0 +1,101 @@
+"""Policies on disk: weights and plain settings, no pickles.
+
+``policy.pt`` is read with ``torch.load(weights_only=True)``: a policy from a stranger can be wrong, but runs no code.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.policies import BasePolicy
+
+from taa_envs.errors import TaaEnvsError
+from taa_envs.files import written_whole
+from train.config import Config
+
+FORMAT = "taa-policy/1"
+CLASSES = {"ppo": PPO, "sac": SAC}
+
+
+def tensors(value: Any) -> Any:
+    """The same with arrays as tensors and numpy numbers as plain ones, which ``weights_only`` loading accepts."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value))
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {k: tensors(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [tensors(v) for v in value]
+    return value
+
+
+def arrays(value: Any) -> Any:
+    """The same with tensors as arrays; undoes :func:`tensors`."""
+    if isinstance(value, torch.Tensor):
+        return value.numpy()
+    if isinstance(value, dict):
+        return {k: arrays(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [arrays(v) for v in value]
+    return value
+
+
+def save_torch(file: Path, content: dict[str, Any]) -> None:
+    """Write whole or not at all."""
+    with written_whole(file) as partial:
+        torch.save(content, partial)
+
+
+def load_torch(file: str | os.PathLike, kind: str) -> dict[str, Any]:
+    """Read a file of :func:`save_torch` whose "format" is kind.
+
+    Raises:
+        TaaEnvsError: it is not one.
+    """
+    if not Path(file).is_file():
+        raise TaaEnvsError(f"no such file: {file}; give the policy.pt that `taa train` wrote")
+    try:
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # zip, pickle and tensor errors of many kinds
+        raise TaaEnvsError(f"{file} cannot be read ({type(error).__name__}); give the policy.pt that `taa train` wrote"
+                           ) from None
+    if not isinstance(content, dict) or content.get("format") != kind:
+        raise TaaEnvsError(f"{file} is not a {kind} file; give the policy.pt that `taa train` wrote")
+    return content
+
+
+def save_policy(file: Path, policy: BasePolicy, config: Config, asset_id: str) -> None:
+    """Write a trained policy."""
+    save_torch(file, {"format": FORMAT, "algo": config.algo, "asset": asset_id, "action": config.action,
+                      "policy": dict(config.policy), "observation_size": policy.observation_space.shape[0],
+                      "action_size": policy.action_space.shape[0], "weights": policy.state_dict()})
+
+
+def load_policy(file: str | os.PathLike) -> tuple[BasePolicy, dict[str, Any]]:
+    """A policy (``predict(observation, deterministic=True)``) and its settings: algo, asset, action.
+
+    Args:
+        file: ``policy.pt``, or the folder that holds it.
+
+    Raises:
+        TaaEnvsError: there is none, or it is not one.
+    """
+    if Path(file).is_dir():
+        file = Path(file) / "policy.pt"
+    content = load_torch(file, FORMAT)
+    try:
+        made = CLASSES[content["algo"]].policy_aliases["MlpPolicy"](
+            spaces.Box(-10.0, 10.0, (content["observation_size"],), np.float32),
+            spaces.Box(-1.0, 1.0, (content["action_size"],), np.float32), lambda _: 0.0, **content["policy"])
+        made.load_state_dict(content["weights"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise TaaEnvsError(f"{file} does not hold a whole policy ({str(error)[:100]}); train it again") from None
+    made.set_training_mode(False)
+    return made, {name: content[name] for name in ("algo", "asset", "action")}

@@ -1,0 +1,204 @@
+"""Training with Stable-Baselines3, in a folder that survives a kill.
+
+::
+
+    RUN/config.json      settings, the asset's id and digest
+    RUN/checkpoint.pt    all that training goes on from: weights, optimisers, generators, every simulation's state
+    RUN/curve.csv        one row an iteration
+    RUN/policy.pt        the policy so far, for `taa evaluate`
+
+A run that was killed goes on from its last checkpoint as if nothing had happened: the curve is the same, row by row.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.util
+import json
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, configure
+
+from taa_envs.asset import Asset
+from taa_envs.errors import TaaEnvsError
+from taa_envs.files import written_whole
+from taa_envs.vector import BatchedArticulationEnv
+from train.config import Config
+from train.policy import CLASSES, arrays, load_torch, save_policy, save_torch, tensors
+from train.vec import BatchedVecEnv
+
+FORMAT = "taa-checkpoint/1"
+COLUMNS = ("steps", "episodes", "success", "return", "progress", "seconds")
+WINDOW = 100  # episodes that a row of the curve averages over
+CHUNK = 2048  # environment steps between rows of SAC's curve; PPO has one a rollout
+
+
+class _Episodes(BaseCallback):
+    """Collects how episodes ended."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+        self.last: deque[list[float]] = deque(maxlen=WINDOW)
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            if "episode" in info:
+                self.count += 1
+                self.last.append([float(info["is_success"]), info["episode"]["r"], info["joint_progress"]])
+        return True
+
+    def means(self) -> list[float]:
+        return np.mean(self.last, axis=0).tolist() if self.last else [float("nan")] * 3
+
+
+def train(asset: Asset, config: Config, folder: Path, *, progress: Callable[[float, dict], None] | None = None) -> dict:
+    """Train a policy, or go on with a run that was begun with the same settings.
+
+    Args:
+        asset: what to train on.
+        config: settings.  ``steps`` may be larger than the run's was: it then goes on.
+        folder: the run's, made if missing.
+        progress: called after every iteration with the share done and the curve's row.
+
+    Returns:
+        run (path), policy (path), resumed_at (steps), steps, and the curve's last success, return and progress.
+
+    Raises:
+        TaaEnvsError: the folder holds a run with other settings, or something else.
+    """
+    folder = Path(folder)
+    described = {"asset": asset.id, "model_sha256": hashlib.sha256(asset.model_path.read_bytes()).hexdigest(),
+                 **{k: v for k, v in config.as_dict().items() if k not in ("steps", "checkpoint_every")}}
+    _claim(folder, described)
+    env = BatchedVecEnv(BatchedArticulationEnv(
+        asset, config.envs, autoreset_mode="same_step", reward=config.reward, action=config.action,
+        randomize=config.randomize))
+    torch.set_num_threads(1)  # small networks: threads cost more than they bring, and results depend on them
+    kind = CLASSES[config.algo]
+    try:
+        model = kind("MlpPolicy", env, policy_kwargs=dict(config.policy), seed=config.seed, device="cpu", verbose=0,
+                     **config.algorithm)
+    except TypeError as error:
+        raise TaaEnvsError(f"the settings do not fit Stable-Baselines3's {kind.__name__} ({error}); mend them"
+                           ) from None
+    model.set_logger(_logger(folder))
+    if config.algo == "ppo":  # begin as the replay: the mean action of a fresh policy is then zero
+        with torch.no_grad():
+            model.policy.action_net.weight.zero_()
+    episodes, rows = _Episodes(), []
+    chunk = config.envs * model.n_steps if config.algo == "ppo" else CHUNK
+    checkpoint = folder / "checkpoint.pt"
+    resumed, seconds = 0, 0.0
+    if checkpoint.exists():
+        rows = _restore(model, env, episodes, arrays_of(checkpoint))
+        resumed, seconds = model.num_timesteps, rows[-1][-1] if rows else 0.0
+    begin, saved = time.monotonic() - seconds, model.num_timesteps
+    while model.num_timesteps < config.steps:
+        # The first call resets the environments, the others go on.
+        model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
+        rows.append([model.num_timesteps, episodes.count, *episodes.means(), time.monotonic() - begin])
+        for name, value in zip(COLUMNS[1:], rows[-1][1:], strict=True):
+            model.logger.record(f"taa/{name}", value)
+        model.logger.dump(model.num_timesteps)
+        if progress is not None:
+            progress(min(model.num_timesteps / config.steps, 1.0), dict(zip(COLUMNS, rows[-1], strict=True)))
+        if model.num_timesteps - saved >= config.checkpoint_every or model.num_timesteps >= config.steps:
+            save_torch(checkpoint, _checkpoint(model, env, episodes, rows))
+            save_policy(folder / "policy.pt", model.policy, config, asset.id)
+            _write_curve(folder / "curve.csv", rows)
+            saved = model.num_timesteps
+    env.close()
+    last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
+    return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
+            "steps": model.num_timesteps,
+            **{k: None if np.isnan(last[k]) else last[k] for k in ("success", "return", "progress") if k in last}}
+
+
+def _claim(folder: Path, described: dict) -> None:
+    file = folder / "config.json"
+    text = json.dumps(described, indent=1, sort_keys=True)
+    if file.is_file():
+        if json.loads(file.read_text(encoding="utf-8")) != json.loads(text):
+            raise TaaEnvsError(f"{folder} holds a run with other settings or of another asset; choose another --out")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise TaaEnvsError(f"{folder} is not a training run and not empty; choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    with written_whole(file) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def _logger(folder: Path) -> Logger:
+    """Event files for TensorBoard where it is installed; the curve is written in any case."""
+    found = importlib.util.find_spec("tensorboard") is not None
+    return configure(str(folder / "tensorboard"), ["tensorboard"]) if found else Logger(None, [])
+
+
+def _write_curve(file: Path, rows: list[list[float]]) -> None:
+    with written_whole(file) as partial, partial.open("w", newline="", encoding="utf-8") as f:
+        writer = csv.writer(f)
+        writer.writerow(COLUMNS)
+        writer.writerows(rows)
+
+
+def _checkpoint(model: BaseAlgorithm, env: BatchedVecEnv, episodes: _Episodes, rows: list) -> dict[str, Any]:
+    _, variables = model._get_torch_save_params()
+    state = np.random.get_state()  # noqa: NPY002 - the generator that Stable-Baselines3 draws from
+    content = {
+        "format": FORMAT, "parameters": model.get_parameters(),
+        "variables": {name: getattr(model, name).detach().clone() for name in variables},
+        "model": {"num_timesteps": model.num_timesteps, "_n_updates": model._n_updates,
+                  "_episode_num": model._episode_num},
+        "last_obs": model._last_obs, "last_episode_starts": model._last_episode_starts, "env": env.get_state(),
+        "torch": torch.get_rng_state(), "numpy": [state[1], state[2], state[3], state[4]],
+        "actions": model.action_space.np_random.bit_generator.state,
+        "episodes": {"count": episodes.count, "last": [list(e) for e in episodes.last]}, "rows": rows,
+    }
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is not None:
+        filled = buffer.buffer_size if buffer.full else buffer.pos
+        content["buffer"] = {"pos": buffer.pos, "full": buffer.full,
+                             **{name: getattr(buffer, name)[:filled] for name in _BUFFER}}
+    return tensors(content)
+
+
+_BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def arrays_of(file: Path) -> dict[str, Any]:
+    """A checkpoint; its parameters and generator stay tensors."""
+    content = load_torch(file, FORMAT)
+    kept = {name: content.pop(name) for name in ("parameters", "variables", "torch")}
+    return {**arrays(content), **kept}
+
+
+def _restore(model: BaseAlgorithm, env: BatchedVecEnv, episodes: _Episodes, content: dict[str, Any]) -> list:
+    model.set_parameters(content["parameters"], exact_match=True, device="cpu")
+    for name, value in content["variables"].items():
+        getattr(model, name).data = value
+    for name, value in content["model"].items():
+        setattr(model, name, value)
+    model._last_obs, model._last_episode_starts = content["last_obs"], content["last_episode_starts"]
+    env.reset()  # as a fresh run does, before the states are put in place of what it made
+    env.set_state(content["env"])
+    if "buffer" in content:
+        buffer = model.replay_buffer
+        buffer.pos, buffer.full = content["buffer"]["pos"], content["buffer"]["full"]
+        for name in _BUFFER:
+            getattr(buffer, name)[:len(content["buffer"][name])] = content["buffer"][name]
+    episodes.count = content["episodes"]["count"]
+    episodes.last.extend(content["episodes"]["last"])
+    model.action_space.np_random.bit_generator.state = content["actions"]
+    np.random.set_state(("MT19937", *content["numpy"]))  # noqa: NPY002
+    torch.set_rng_state(content["torch"])
+    return content["rows"]
