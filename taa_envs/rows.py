@@ -7,13 +7,16 @@ written on top of them (:mod:`taa_envs.task`) does not know which it has: a batc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from taa_envs.hands import Controller
 from taa_envs.hands.points import PointsController
 from taa_envs.scene import Scene
+
+if TYPE_CHECKING:
+    import mujoco
 
 # Model fields that an episode may change, see taa_envs.randomize.
 MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping", "dof_frictionloss")
@@ -56,14 +59,15 @@ class Rows(Protocol):
 
 
 class SingleRows:
-    """One simulation on an MjData."""
+    """One simulation on an ``mujoco.MjData`` of the scene's model: a new one, or the one given."""
 
     n = 1
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, data: mujoco.MjData | None = None) -> None:
         import mujoco
 
-        self._mujoco, self.model, self.data = mujoco, scene.model, mujoco.MjData(scene.model)
+        self._mujoco, self.model = mujoco, scene.model
+        self.data = mujoco.MjData(scene.model) if data is None else data
         self.qpos, self.qvel = self.data.qpos[None], self.data.qvel[None]
         self.ctrl, self.sensordata = self.data.ctrl[None], self.data.sensordata[None]
         self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
