@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo
-from reconstruct.providers.lk_tracks import change_region, reference_frames, track_points
+from reconstruct.providers.lk_tracks import change_region, even_exposure, reference_frames, track_points
 from tests.reconstruct.joint_scenes import make_video
 from tests.reconstruct.textures import turning_plate
 
@@ -53,3 +53,19 @@ def test_reference_frames_follow_the_motion():
     refs = reference_frames(make_video(40).with_frames(still))
     assert refs[0] == 0 and refs[-1] == 39
     assert (refs > 19).sum() > 2 * (refs <= 19).sum()
+
+
+def test_exposure_jumps_do_not_drag_points():
+    frames, _ = turning_plate(2)
+    rng = np.random.default_rng(0)
+    bright = [
+        np.clip(g * frames[0].astype(float) + o, 0, 255) for g, o in ((1, 0), (1, 0), (0.7, 20), (0.7, 20), (1.2, -10))
+    ]
+    noisy = np.stack([np.clip(b + rng.normal(scale=1.5, size=b.shape), 0, 255).astype(np.uint8) for b in bright])
+    video = make_video(len(noisy)).with_frames(noisy)
+    level = np.stack(even_exposure(video)).astype(float)
+    assert np.abs(level[:, 40:-40, 40:-40] - np.median(level, axis=0)[40:-40, 40:-40]).mean() < 4
+    assert (
+        np.array_equal(level[0], cv2.cvtColor(noisy[0], cv2.COLOR_BGR2GRAY)) or np.abs(level[0] - level[1]).mean() < 4
+    )
+    assert change_region(video).mean() < 0.1
