@@ -36,7 +36,8 @@ class StaticBlock:
         solid: the block.  end: the state at which the link is closed onto it.
         scores: {"start", "other"} of the two ends, and whether they differ enough: ``decided``.
         depth: of the block along the closing direction.
-        seen: (h, w) bool, the body's pixels on the plate (the picture shrunk), or None where it could not be told from its surroundings.
+        seen: (h, w) bool, the body's pixels on the plate (the picture shrunk), or None where it could not be told
+            from its surroundings.
     """
 
     solid: Manifold
@@ -89,7 +90,11 @@ def place_block(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mas
         if slides_in_plane:
             wide, _ = static_box(shape, plane, fit, end, clearance, WIDEN)
             area = fill_hull(plate, project(plate, fit, to_arrays(wide)[0]))
-        body, contrast = separate(plate, area)
+        # Where the block is too small its surroundings are the body itself: of two borders the clearer counts.
+        margin = 2 * max(2, int(0.12 * np.sqrt(area.sum()))) + 1
+        beyond = cv2.dilate(area.astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0
+        body, contrast = max((separate(plate, a) for a in (area, beyond)), key=lambda found: found[1])
+        body = body & area
         # What the closed link hid in all frames is the body behind it, as far as anybody knows.
         shut = _covered(plate, fit, shape, plane, [end])
         whole = _joined(body | (shut & ~plate.known), shut)

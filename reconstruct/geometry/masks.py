@@ -140,10 +140,12 @@ def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evide
         uv = apply_homography(S, fit.project(points[n]))
         for u, v in uv[np.isfinite(uv).all(-1)]:
             cv2.circle(seeds, (int(np.clip(u, -10, 9999)), int(np.clip(v, -10, 9999))), 1, 1, -1)
+        drawn = outline[n] & ~hand[n]
         mask = _cut(small[n], outline[n], wide[n], hand[n], change[n], noise, seeds > 0, max(2, reach // 2))
         both = (mask & outline[n] & ~hand[n]).sum()
         either = ((mask | outline[n]) & ~hand[n]).sum()
-        agreement[n] = both / max(either, 1)
+        # Where no cut was possible the outline agrees with itself: that is no evidence.
+        agreement[n] = both / max(either, 1) if (mask != drawn).any() else 0.2
         # What the hand hides here may show where this mask is carried to: the outline knows it from other frames.
         whole = mask | (outline[n] & cv2.dilate(hand[n].astype(np.uint8), _disc(2)).astype(bool))
         masks.append(window.paste(whole, video.frames.shape[1:3]))

@@ -290,10 +290,48 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
     else:
         (low, high), origin = assumed, "assumed"
     slab = Shape((Slice(outline, low, high),), draw(low, high), origin, "slab", reach)
+    deep = _deepen(views, fit, plane, chart, slab, extent)
+    if deep is not None:
+        slab = deep
     # A link seen from one side only gives its silhouettes no say about depth: a hull would be a guess in 16 parts.
     turned = float(np.ptp(np.abs(plane.facing[views.frames]))) > 0.25
     stack = _stack(views, fit, plane, chart, slab, extent) if turned else None
     return stack if stack is not None and stack.iou > slab.iou + 0.03 else slab
+
+
+def off_plane(plane: LinkPlane) -> tuple[float, float]:
+    """How far behind and in front of the plane the link's body is known to reach, world units, from points whose
+    tracks the plane cannot explain: their median, if they are many on that side and beyond the others' scatter."""
+    out = plane.spread[~plane.inlier]
+    noise = 2 * float(np.quantile(np.abs(plane.spread[plane.inlier]), 0.9)) if plane.inlier.any() else 0.0
+    many = max(5, 0.08 * len(plane.spread))
+    reach = []
+    for side in (-1, 1):
+        there = side * out[side * out > noise]
+        there = there[there < 0.5 * plane.extent]
+        reach.append(float(np.median(there)) if len(there) >= many else 0.0)
+    return reach[0], reach[1]
+
+
+def _deepen(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, slab: Shape, extent: float) -> Shape | None:
+    """The slab made as thick as points off its plane say; its outline then is where both of its faces project
+    into the silhouettes. None if no points say so, or the silhouettes fit worse."""
+    behind, front = off_plane(plane)
+    low, high = min(slab.slices[0].low, -behind), max(slab.slices[0].high, front)
+    if (low, high) == (slab.slices[0].low, slab.slices[0].high):
+        return None
+    cells = None
+    for z in (low, (low + high) / 2, high):
+        share, total = vote(views, fit, plane, chart, z)
+        unseen = total <= 0.05 * total.max()
+        here = fill_unseen((share > 0.5) & ~unseen, unseen)
+        cells = here if cells is None else cells & here
+    outline = tidy(trace(chart, cells, 0.018 * extent))
+    if outline.is_empty or outline.area < 0.3 * slab.slices[0].outline.area:
+        return None
+    body = (Slice(outline, low, high),)
+    iou = agreement(silhouette(body, views, fit, plane), views)
+    return replace(slab, slices=body, iou=iou, thickness_origin="fitted") if iou > slab.iou - 0.05 else None
 
 
 def _stack(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, slab: Shape, extent: float,
