@@ -150,7 +150,7 @@ class PointsRows:
 
     def __init__(self, controller: PointsController, rows: Rows) -> None:
         self.weights, self.hand = controller.weights, controller.hand
-        count = len(self.weights)
+        count, self._damping = len(self.weights), controller.hand.damping
 
         def view(array: np.ndarray, columns: np.ndarray) -> np.ndarray:
             first = int(columns[0, 0])
@@ -175,7 +175,7 @@ class PointsRows:
     def control(self, target: np.ndarray) -> None:
         """Aim at targets (n, S, 3) m within the limits of each sphere and of the whole hand."""
         hand, here, limit = self.hand, self._here, self.hand.sphere_force
-        drag = hand.damping * self._speed
+        drag = self._damping * self._speed
         pull = target - here
         pull *= hand.stiffness
         pull -= drag

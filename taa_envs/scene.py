@@ -131,17 +131,24 @@ def _add_touch(spec: mujoco.MjSpec) -> None:
         sensor.intprm[:3] = [sum(1 << int(d) for d in data), reduce, 1]
 
 
-def decode_touch(scene: Scene, sensordata: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def touch_columns(scene: Scene) -> tuple[int, int]:
+    """Where the two sensors' numbers begin in ``sensordata``."""
+    return int(scene.model.sensor("touch").adr[0]), int(scene.model.sensor("touch_depth").adr[0])
+
+
+def decode_touch(columns: tuple[int, int], sensordata: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What touched the moving link in the step that MuJoCo has just made.
 
     Args:
+        columns: of :func:`touch_columns`.
         sensordata: (..., nsensordata).
 
     Returns:
         force (..., 3) N on the link, torque (..., 3) N m about position (..., 3) m, asset frame, and depth (...) m of
         the deepest overlap; zeros where nothing touched it.
     """
-    a, b = int(scene.model.sensor("touch").adr[0]), int(scene.model.sensor("touch_depth").adr[0])
+    a, b = columns
     # MuJoCo gives the wrench from the named body on the other; depth is a negative distance.
     return (-sensordata[..., a + 1:a + 4], -sensordata[..., a + 4:a + 7], sensordata[..., a + 7:a + 10],
             np.maximum(-sensordata[..., b], 0.0))

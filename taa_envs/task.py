@@ -16,7 +16,7 @@ from taa_envs import randomize
 from taa_envs.registry import CONTROL_PERIOD
 from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, RewardInputs, goal_reward, reward_scales, reward_terms
 from taa_envs.rows import MODEL_FIELDS, Rows, hand_rows
-from taa_envs.scene import TIMESTEP, Scene, decode_touch
+from taa_envs.scene import TIMESTEP, Scene, decode_touch, touch_columns
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 TRANSLATION, ROTATION, CLOSURE = 0.03, 0.3, 0.5  # m, rad, share of the way: residuals of an action of 1
@@ -35,21 +35,36 @@ RESET_OPTIONS = ("q0", "phase", "randomize")
 PARTS = {"joint": 2, "hand": 66, "contact": 5, "reference": 2 + 63 + 4 * len(PREVIEW)}
 
 
+_MEANS = np.zeros((2, 21))  # of finger tips, of the palm
+_MEANS[0, list(TIPS)], _MEANS[1, list(PALM)] = 1 / len(TIPS), 1 / len(PALM)
+_STEPS, _AHEAD = np.arange(SUBSTEPS), np.array((0.0, *PREVIEW))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(..., 3); np.cross costs more than a simulation step."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
+
+
 def apply_residual(joints: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """Landmarks (..., 21, 3) m, moved, turned about the palm and closed by actions (..., 7)."""
+    """Landmarks (..., 21, 3) m, moved, turned about the palm and closed by actions (..., 7); leading axes broadcast."""
     action = np.asarray(action, float)
-    tips = joints[..., TIPS, :].mean(-2, keepdims=True)
-    moved = joints + (CLOSURE * action[..., 6, None] * CURL)[..., None] * (tips - joints)
+    means = _MEANS @ joints
+    moved = joints + (CLOSURE * action[..., 6, None] * CURL)[..., None] * (means[..., :1, :] - joints)
     rotvec = ROTATION * action[..., 3:6]
-    angle = np.sqrt((rotvec * rotvec).sum(-1))[..., None, None]
-    x, y, z = np.moveaxis(rotvec, -1, 0)
-    zero = np.zeros_like(x)
-    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
-    # Rodrigues with sin(a)/a and (1 - cos(a))/a^2, so that nothing is divided by zero.
-    rotation = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (K @ K)
-    palm = joints[..., PALM, :].mean(-2, keepdims=True)
-    turned = (moved - palm) @ np.swapaxes(rotation, -1, -2) + palm
-    return np.where(angle > 0.0, turned, moved) + TRANSLATION * action[..., None, :3]
+    if rotvec.any():
+        square = (rotvec * rotvec).sum(-1)[..., None, None]
+        angle = np.sqrt(square)
+        K = np.zeros((*rotvec.shape, 3))
+        x, y, z = rotvec[..., 0], rotvec[..., 1], rotvec[..., 2]
+        K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -z, y, -x
+        K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = z, -y, x
+        # Rodrigues with sin(a)/a and (1 - cos(a))/a^2, so that nothing is divided by zero.
+        rotation = np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (K @ K)
+        # As what is added to the landmarks, so that no turn adds nothing at all.
+        moved = moved + (moved - means[..., 1:, :]) @ np.swapaxes(rotation, -1, -2)
+    return moved + TRANSLATION * action[..., None, :3]
 
 
 class Task:
@@ -72,7 +87,7 @@ class Task:
         self.action_size = RESIDUALS if self.residual else ABSOLUTES
         self.observation_parts = {**PARTS, "action": self.action_size}
         self._hand = hand_rows(scene, rows)
-        self._lead = scene.hand.lead
+        self._lead, self._touch = scene.hand.lead, touch_columns(scene)
         reference, demo, model = self.asset.reference, self.asset.demo, scene.model
         self._times, self._reference_q = reference.time, reference.q
         self._joints = reference.hand_joints
@@ -171,11 +186,10 @@ class Task:
 
     def targets(self, action: np.ndarray) -> np.ndarray:
         """(n, SUBSTEPS, 21, 3) m: where the landmarks are to be in the next step's substeps, for actions (n, A)."""
-        steps = np.arange(SUBSTEPS)
-        offset = self._offset[:, None, None, :]
+        steps, offset = _STEPS, self._offset[:, None, None, :]
         if self.residual:
             t = self._start[:, None] + (self._count[:, None] + steps) * TIMESTEP + self._lead
-            return apply_residual(self.path(t), np.repeat(action[:, None], SUBSTEPS, axis=1)) + offset
+            return apply_residual(self.path(t), action[:, None]) + offset
         goal = self._joints[0] + self.reach * action.reshape(self.n, 21, 3) + self._offset[:, None]
         way = goal - self._aim
         length = np.sqrt((way * way).sum(-1, keepdims=True))
@@ -205,13 +219,13 @@ class Task:
             touch[:, k] = rows.sensordata
         if ids is not None:  # results of others are not to change their episodes
             kept = {name: getattr(self, name).copy() for name in ("_hit", "_seen", *self._STEP)}
-        force, torque, position, depth = decode_touch(self.scene, touch)
+        force, torque, position, depth = decode_touch(self._touch, touch)
         contact = (force * force).sum(-1) > 0  # (n, SUBSTEPS)
         load = (force * self._axis[:, None]).sum(-1)
         if self._hinge:
-            moment = torque + np.cross(position - self._point[:, None], force)
+            moment = torque + _cross(position - self._point[:, None], force)
             load = (moment * self._axis[:, None]).sum(-1)
-        moved = np.diff(q, axis=1)
+        moved = q[:, 1:] - q[:, :-1]
         driven = np.where((moved * self._direction > 0) & (load * moved > 0), np.abs(moved), 0.0).sum(1)
         driven = driven / abs(self._stroke)
         self._mark(contact)
@@ -247,7 +261,7 @@ class Task:
 
     def _mark(self, contact: np.ndarray) -> None:
         """Note which of the reference's frames were played, and in which the hand pushed (n, SUBSTEPS)."""
-        t = self._start[:, None] + (self._count[:, None] + np.arange(SUBSTEPS)) * TIMESTEP
+        t = self._start[:, None] + (self._count[:, None] + _STEPS) * TIMESTEP
         frame = self._times.searchsorted(t + 1e-9, side="right") - 1
         index = frame + np.arange(self.n)[:, None] * len(self._times)
         self._seen.ravel()[index] = True
@@ -259,7 +273,7 @@ class Task:
         axis, point = self._axis[rows][:, None], self._point[rows][:, None]
         if self._hinge:  # into the link's own frame: back by q
             arm, c, s = tips - point, np.cos(q)[:, None, None], np.sin(-q)[:, None, None]
-            local = point + arm * c + np.cross(axis, arm) * s + axis * ((arm * axis).sum(-1, keepdims=True) * (1 - c))
+            local = point + arm * c + _cross(axis, arm) * s + axis * ((arm * axis).sum(-1, keepdims=True) * (1 - c))
         else:
             local = tips - axis * q[:, None, None]
         surface = self.scene.surface
@@ -302,8 +316,9 @@ class Task:
         asset, duration = self.asset, self.asset.demo["duration"]
         t = self._start + self._count * TIMESTEP
         here = self._hand.landmarks()
-        ahead = self.path(t[:, None] + np.array((0.0, *PREVIEW)))  # (n, 1 + previews, 21, 3)
-        moments = np.interp(t[:, None] + np.array((0.0, *PREVIEW)), self._times, self._reference_q)
+        times = t[:, None] + _AHEAD
+        ahead = self.path(times)  # (n, 1 + previews, 21, 3)
+        moments = np.interp(times, self._times, self._reference_q)
         stroke = asset.stroke_fraction(moments)
         centres = ahead.mean(2)
         n, size = self.n, self.scene.size
