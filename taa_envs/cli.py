@@ -209,6 +209,25 @@ class Export(Common):
 
 
 @dataclass(kw_only=True)
+class Diagnose(Common):
+    """Say what a model gets wrong about a joint, from measured logs, and write the extended model."""
+
+    model: tyro.conf.Positional[str]
+    """Id of an asset, or an MJCF file."""
+    joint: str = "joint"
+    """Name of the joint in the model."""
+    data: list[Path]
+    """Joint logs, one episode a CSV: time, q, then torque or a hand's force and point."""
+    out: Path
+    """Folder to write: diagnosis.json, report.html, model_extended.xml."""
+    overwrite: bool = False
+    """Replace that folder."""
+
+    def run(self) -> Outcome:
+        return commands.diagnose(self.model, self.joint, self.data, self.out, self.overwrite)
+
+
+@dataclass(kw_only=True)
 class Synth(Common):
     """Render videos with known ground truth."""
 
@@ -247,6 +266,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )

@@ -239,6 +239,32 @@ def export(asset_id: str, kind: str, out: Path | None, overwrite: bool) -> Outco
     return Outcome({"id": asset_id, "format": kind, "path": str(target)}, lambda: print(target / "model.xml"))
 
 
+def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: bool) -> Outcome:
+    from diagnose import diagnose as run
+
+    if out.exists() and not overwrite:
+        raise TaaEnvsError(f"{out} exists; choose another --out or use --overwrite")
+    result = run(model, data, joint, say=lambda line: print(line, file=sys.stderr))
+    with folder_written_whole(out, overwrite) as work:
+        result.write(work, final=out)
+
+    def words() -> None:
+        d = result.data
+        rows = [(c["name"], name, _short(p["value"]) + " " + p["unit"], f"{p['ci95'][0]:.4g} to {p['ci95'][1]:.4g}")
+                for c in d["causes"] for name, p in c["parameters"].items()]  # fmt: skip
+        rows = rows or [(c["name"], "", "", "") for c in d["causes"]]
+        _table(f"{joint}: {d['verdict']}", [("cause", "parameter", "value", "95 % interval"), *rows], header=True)
+        for other in d["alternatives"]:
+            print(f"as well explained by: {' + '.join(other)}")
+        if d["next_experiment"]:
+            print(f"measure next: {d['next_experiment']}")
+        print(f"held-out error {d['nominal']['heldout_rmse']:.4g} -> {d['extended']['heldout_rmse']:.4g} {d['unit']} "
+              f"(noise {d['noise_floor']:.4g})")  # fmt: skip
+        print(f"report  {out / 'report.html'}")
+
+    return Outcome(result.data, words)
+
+
 def synth(out: Path, clip: str | None, overwrite: bool, seed: int) -> Outcome:
     from reconstruct.synth import list_clips, render_clip
 

@@ -1,0 +1,86 @@
+"""Every cause's edit of the MJCF does in MuJoCo what the fit's own integrator assumes."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from diagnose.causes import CAUSES, UNNAMED
+from diagnose.log import JointLog
+from diagnose.plant import isolated, load_plant
+from diagnose.simulate import Frame, Job, mujoco_rollout, prepare, rollouts
+
+XML = """<mujoco><compiler angle="{angle}"/><option timestep="0.001" integrator="implicitfast"/><worldbody>
+<body pos="0 0 1"><joint name="j" type="hinge" axis="0 1 0.5" stiffness=".1" springref="{ref}" damping=".01"/>
+<geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.4" mass="1"/></body></worldbody></mujoco>"""
+TERMS = [
+    ("viscous_damping", dict(damping=0.05), 1e-3), ("quadratic_drag", dict(drag=0.03), 1e-3),
+    ("coulomb_friction", dict(coulomb=0.1), 1e-3),
+    ("stribeck_friction", dict(coulomb=0.05, stiction=0.1, stribeck_velocity=0.3), 0.05),
+    ("spring", dict(stiffness=0.5, spring_torque=0.2), 1e-3), ("constant_torque", dict(torque=0.3), 1e-3),
+    ("gravity_torque", dict(gravity_sin=0.3, gravity_cos=-0.2), 1e-3), ("inertia", dict(inertia=0.01), 1e-3),
+    ("inertia", dict(inertia=-0.01), 1e-3),
+    ("end_stop", dict(stop_place=0.5, stop_stiffness=30.0, stop_damping=0.1), 5e-3),
+    ("detent", dict(detent_place=0.2, detent_strength=0.4, detent_width=0.1), 0.01),
+]  # fmt: skip
+FRAME = Frame((-1.0, 1.0), (-5.0, 5.0))
+
+
+def episode(plant):
+    t = np.arange(0, 3, 0.01)
+    return prepare(plant, JointLog("a", t, np.sin(t), np.where(t < 1.0, 0.8, 0.0)), most=1e-3)
+
+
+@pytest.mark.parametrize("angle, ref", [("radian", 0.2), ("degree", np.degrees(0.2))])
+@pytest.mark.parametrize("name, terms, tolerance", TERMS)
+def test_edit_agrees_with_the_fit(tmp_path, name, terms, tolerance, angle, ref):
+    path = tmp_path / "m.xml"
+    path.write_text(XML.format(angle=angle, ref=ref))
+    plant = load_plant(path, "j")
+    spec = mujoco.MjSpec.from_file(str(path))
+    CAUSES[name].edit(spec, "j", terms, plant, FRAME)
+    spec.compile()
+    again = mujoco.MjSpec.from_string(spec.to_xml())  # what a user will load
+    model = isolated(again, "j")
+    assert model.nu == 0
+    ep = episode(plant)
+    real = mujoco_rollout(model, ep, 0.1, 0.0)
+    ours = rollouts(plant, [ep], [Job(terms, 0, 0.1, 0.0)], FRAME)[0]
+    nominal = rollouts(plant, [ep], [Job({}, 0, 0.1, 0.0)], FRAME)[0]
+    effect = np.abs(ours - nominal).max()
+    assert effect > 0.02
+    assert np.abs(real - ours).max() < max(tolerance, 2e-3)
+
+
+def test_names_are_those_of_the_contract():
+    contract = {"viscous_damping", "quadratic_drag", "coulomb_friction", "stribeck_friction", "spring",
+                "constant_torque", "gravity_torque", "inertia", "end_stop", "detent", "time_delay", "sensor_bias",
+                "sensor_gain"}  # fmt: skip
+    assert set(CAUSES) - set(UNNAMED) == contract
+    terms = [p.term for c in CAUSES.values() for p in c.parameters]
+    assert set(terms) <= set(__import__("diagnose.simulate", fromlist=["TERMS"]).TERMS)
+
+
+def test_hand_force_is_a_torque_about_the_axis(tmp_path):
+    path = tmp_path / "m.xml"
+    path.write_text(XML.format(angle="radian", ref=0.2).replace("0 1 0.5", "0 0 1"))
+    plant = load_plant(path, "j")
+    t = np.arange(50) * 0.01
+    force, point = np.tile([0.0, 2.0, 5.0], (50, 1)), np.tile([0.3, 0.1, 7.0], (50, 1))
+    log = JointLog("f", t, 0 * t, force=force, point=point)
+    assert plant.input_torque(log) == pytest.approx(np.full(50, 0.6))
+
+
+def test_step_input_is_aligned_to_a_fraction_of_a_step(tmp_path):
+    """A torque step between even samples gives a parabola from its own time on."""
+    path = tmp_path / "m.xml"
+    path.write_text(XML.format(angle="radian", ref=0.0).replace('stiffness=".1"', "").replace('damping=".01"', "")
+                    .replace("0 1 0.5", "0 0 1"))  # fmt: skip
+    plant = load_plant(path, "j")
+    t = np.arange(0, 1, 0.01)
+    log = JointLog("s", t, np.sin(t), np.where(t >= 0.3 - 1e-9, 0.01, 0.0))
+    ep = prepare(plant, log)
+    got = rollouts(plant, [ep], [Job({}, 0, 0.0, 0.0)], FRAME)[0]
+    exact = 0.5 * 0.01 / plant.inertia * np.maximum(t - 0.3, 0) ** 2
+    assert np.abs(got - exact).max() < 1e-3 * exact.max()
