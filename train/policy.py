@@ -20,7 +20,7 @@ from taa_envs.files import written_whole
 from train.config import Config
 
 FORMAT = "taa-policy/1"
-CLASSES = {"ppo": PPO, "sac": SAC}
+CLASSES: dict[str, Any] = {"ppo": PPO, "sac": SAC}
 
 
 def tensors(value: Any) -> Any:

@@ -192,7 +192,7 @@ def _restore(model: BaseAlgorithm, env: BatchedVecEnv, episodes: _Episodes, cont
     env.reset()  # as a fresh run does, before the states are put in place of what it made
     env.set_state(content["env"])
     if "buffer" in content:
-        buffer = model.replay_buffer
+        buffer = getattr(model, "replay_buffer")  # noqa: B009 - SAC's alone
         buffer.pos, buffer.full = content["buffer"]["pos"], content["buffer"]["full"]
         for name in _BUFFER:
             getattr(buffer, name)[:len(content["buffer"][name])] = content["buffer"][name]

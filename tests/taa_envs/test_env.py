@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import pickle
 import re
 import warnings
+from pathlib import Path
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -43,12 +46,34 @@ def test_gymnasium_check(name: str) -> None:
         check_env(gymnasium.make(name).unwrapped)
 
 
-def test_stable_baselines_check() -> None:
+@pytest.mark.parametrize("arguments", [{"render_mode": "rgb_array", "height": 64}, {"action": "absolute"},
+                                       {"observation": "dict"}, {"reward": "sparse_goal"}, {"randomize": True}])
+def test_checkers_on_every_kind(arguments: dict) -> None:
     from stable_baselines3.common.env_checker import check_env as check
 
+    env = gymnasium.make("TAA/door", **arguments).unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check(gymnasium.make("TAA/door", render_mode="rgb_array", height=64).unwrapped)
+        warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
+        check(env)
+        if "render_mode" not in arguments:
+            check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", ["door", "drawer"])
+def test_golden_rollout(name: str, request: pytest.FixtureRequest) -> None:
+    """The joint after each half second of the replay, as this version of MuJoCo gave it when it was written down."""
+    golden = json.loads((Path(__file__).parent / "golden.json").read_text())
+    if mujoco.__version__ not in golden:
+        pytest.skip(f"no golden rollout for MuJoCo {mujoco.__version__}; write one into golden.json")
+    env = ArticulationEnv(request.getfixturevalue(name))
+    env.reset(seed=0)
+    q = []
+    for step in range(1, 101):
+        env.step(ZERO)
+        if step % 25 == 0:
+            q.append(env.q)
+    np.testing.assert_allclose(q, golden[mujoco.__version__][name], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["door", "drawer"])
