@@ -219,9 +219,11 @@ def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: 
     named = best.causes if verdict in ("explained", "ambiguous") else ()
     after = _errors(plant, best, held, fitted) if named else nominal
     if verdict == "unexplained":
-        after = found.free.held.residuals if found.free is not None else nominal
-        assumptions.append("the extended error is that of free torques over position and velocity beside "
-                           f"{', '.join(best.causes) or 'no cause'}; the model does not hold them")  # fmt: skip
+        tried = [s.held.residuals for s in (best, found.free) if s is not None]
+        after = min([nominal, *tried], key=_rms)
+        if found.free is not None and after is found.free.held.residuals:
+            assumptions.append("the extended error is that of free torques over position and velocity beside "
+                               f"{', '.join(best.causes) or 'no cause'}; the model does not hold them")  # fmt: skip
     ratio, interval = _gain(nominal, after)
     causes = [_cause(n, best.fit, found, plant, fitted.motion.frame.middle) for n in named]
     unit = plant.torque_unit if fitted.driven else plant.unit

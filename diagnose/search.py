@@ -22,7 +22,7 @@ HELD_GAIN = 0.98  # of the held-out error without the cause
 SURE = 4.0  # standard deviations from nothing
 RIVAL = 4.0  # nats within which two sets explain equally well
 KEEP = 6  # candidates that go from windows to whole episodes
-NOISY = 4.0  # times the floor that fast changes show, is the most that slow noise may add up to
+NOISY = 3.4  # times the floor that fast changes show, is the most that slow noise may add up to
 PIECES = 10  # windows of an episode in the first stage of a fit
 
 
@@ -143,7 +143,7 @@ class Search:
             picks = {id(t): t for t in (max(trials, key=lambda t: t.score), min(trials, key=lambda t: t.fit.rss))}
             swapped = [t for p in picks.values() for t in self._swaps(p, grown=size > 1)]
             best = max([*picks.values(), *swapped], key=lambda t: t.score)
-            best = self._prune(best)
+            best = self._polish(self._prune(best))
             if current.bic - best.bic < FIT_MARGIN or best.held_loglik - current.held_loglik < HELD_MARGIN:
                 break
             self.say(f"{' + '.join(best.causes)}: error {best.fit.rmse:.4g}, held out {best.held.rmse:.4g}")
@@ -177,6 +177,19 @@ class Search:
                 return best
             best = top
         return best
+
+    def _polish(self, best: Scored) -> Scored:
+        """Fit the chosen set to the end; the search only goes as far as it needs to compare."""
+        if not best.causes:
+            return best
+        f = fit_many(self.fitted, [best.fit.candidate], iterations=25,
+                     initial=[None if self.fitted.driven else best.fit.initial])[0]  # fmt: skip
+        h = fit_many(self.held, [f.candidate], iterations=5, whitened=0, fixed=True)[0]
+        better = self._scored(f, h)
+        if better.score <= best.score:
+            return best
+        self.done[best.causes] = better
+        return better
 
     def _sure(self, best: Scored) -> Scored:
         """Keep only causes that are clearly not zero and that improve the held-out episodes beyond the margin."""

@@ -93,7 +93,8 @@ def write(case: Case, seed: int, folder: Path, count: int = 6, seconds: float = 
     push = np.zeros((steps + 1, count))
     for i in range(count):
         if case.reversal and i >= count // 3:  # held torques, then let go
-            a, b, c = np.sort(rng.uniform(0.5, 0.75 * seconds, 3))
+            a = rng.uniform(0.1, 0.5) * seconds
+            b, c = a + np.cumsum(rng.uniform(0.3, 0.8, 2))
             size = rng.uniform(0.3, 0.8, 2) * tau
             push[(t >= a) & (t < b), i] = side[i] * size[0]
             push[(t >= b) & (t < c), i] = -side[i] * size[1]
