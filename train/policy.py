@@ -74,7 +74,8 @@ def load_torch(file: str | os.PathLike, kind: str) -> dict[str, Any]:
 def save_policy(file: Path, policy: BasePolicy, config: Config, asset_id: str) -> None:
     """Write a trained policy."""
     save_torch(file, {"format": FORMAT, "algo": config.algo, "asset": asset_id, "action": config.action,
-                      "policy": dict(config.policy), "observation_size": policy.observation_space.shape[0],
+                      "use_sde": bool(config.algorithm.get("use_sde", False)), "policy": dict(config.policy),
+                      "observation_size": policy.observation_space.shape[0],
                       "action_size": policy.action_space.shape[0], "weights": policy.state_dict()})
 
 
@@ -93,7 +94,8 @@ def load_policy(file: str | os.PathLike) -> tuple[BasePolicy, dict[str, Any]]:
     try:
         made = CLASSES[content["algo"]].policy_aliases["MlpPolicy"](
             spaces.Box(-10.0, 10.0, (content["observation_size"],), np.float32),
-            spaces.Box(-1.0, 1.0, (content["action_size"],), np.float32), lambda _: 0.0, **content["policy"])
+            spaces.Box(-1.0, 1.0, (content["action_size"],), np.float32), lambda _: 0.0,
+            use_sde=content["use_sde"], **content["policy"])
         made.load_state_dict(content["weights"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise TaaEnvsError(f"{file} does not hold a whole policy ({str(error)[:100]}); train it again") from None
