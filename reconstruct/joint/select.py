@@ -333,9 +333,33 @@ def search(
         last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
         if kind == "revolute":
             last += [refine(_tilted_back(s, obs), obs, scales=(4.0, 2.0), iterations=20) for s in last[:2]]
+        for s in sorted(last, key=lambda s: -explained(s, obs)[0])[:2]:
+            last += [refine(r, obs, scales=(10.0, 5.0, 3.0, 2.0), iterations=12) for r in _states_anew(s, obs)]
         out += last
         progress(0.8 if kind == "revolute" else 1.0)
     return sorted(out, key=lambda s: -explained(s, obs)[0])
+
+
+def _states_anew(s: State, obs: Observations) -> list[State]:
+    """The joint with its states found afresh: by extension from a half or the middle, and from the motion profile.
+
+    Where few tracks bridge two parts of the video, the states of one part can be off by a constant that no small step
+    undoes; with the axis known, a new start finds them.
+    """
+    K = len(obs.frames)
+    point = None if s.kind == "prismatic" else s.point
+    profile = global_profile(obs)
+    out = []
+    for core in (np.arange(K // 4, K - K // 4), np.arange(K // 2, K), np.arange(0, K // 2)):
+        if len(core) < 4 or np.ptp(s.q[core]) < 0.1 * np.ptp(s.q):
+            continue
+        out.append(extend(Hypothesis(s.kind, s.axis, point, core, s.q[core] - s.q[core[0]], 0.0), obs))
+        # Speed in the picture is about proportional to the joint's: the core gives the factor.
+        dp, dq = np.diff(profile[core]), np.diff(s.q[core])
+        if np.sum(dp**2) > 0:
+            q = profile * np.sum(dp * dq) / np.sum(dp**2)
+            out.append(solve_depths(replace(s, q=q - q[0], depth=np.ones(len(obs.ref))), obs))
+    return out
 
 
 def _tilted_back(s: State, obs: Observations) -> State:
