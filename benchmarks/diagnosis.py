@@ -93,17 +93,17 @@ def main() -> None:
     """Print the table; rows go to stderr as they come."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", help="labels of cells")
-    parser.add_argument("--cases", type=int, default=1, help="cases a cell; mechanisms take turns")
+    parser.add_argument("--cases", type=int, default=1, help="cases a cell; mechanisms take turns, over cells too")
     parser.add_argument("--logs", type=int, default=6, help="logs a case")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     rows: dict[str, list[dict]] = {}
-    for label, names, noise in cells():
+    for number, (label, names, noise) in enumerate(cells()):
         if args.only and label not in args.only:
             continue
         plants = [p for p in injector.PLANTS if not (p == "drawer" and "gravity_torque" in names)]
         for k in range(args.cases):
-            row = run(names, noise, plants[(args.seed + k) % len(plants)], args.seed + k, args.logs)
+            row = run(names, noise, plants[(args.seed + number + k) % len(plants)], args.seed + k, args.logs)
             rows.setdefault(label, []).append(row)
             print(json.dumps({"cell": label, **row}), file=sys.stderr, flush=True)
     print(table(rows))

@@ -212,14 +212,17 @@ class Search:
         """Other sets, no larger, that explain the data as well and do not contain the chosen one."""
         if not best.causes:
             return []
-        self._swaps(best, grown=True)
+        if len(best.causes) == 1:  # pairs may have crowded single causes out of the first round
+            self.score([(n,) for n in self.names])
+        else:
+            self._swaps(best, grown=True)
         extra = set(best.causes)
         out = [s for c, s in self.done.items()
                if c and not extra <= set(c) and len(s.fit.candidate.theta) <= len(best.fit.candidate.theta) + 1
                and len(c) <= len(best.causes) and not _contains(c, best.causes)
                and best.score - s.score < RIVAL
                and all(s.fit.z(n) > 2 for n in c)]  # fmt: skip
-        return sorted(out, key=lambda s: -s.score)[:4]
+        return sorted(out, key=lambda s: -s.score)[:8]
 
     def _left(self, best: Scored) -> tuple[Scored | None, bool, str]:
         """Is anything left? Free torques over q and velocity are given the chance to show it."""

@@ -15,8 +15,8 @@ STEP = 5e-4  # s
 
 # name -> (hinge, inertia, weight torque m g r (rad^-1 sine law), viscous, speed of a push rad/s or m/s, MJCF)
 PLANTS = {
-    "door": (True, 20 * 0.8**2 / 3 + 20 * 0.02**2 / 3, 0.0, 0.3, 1.2,
-             '<body pos="0 0 1"><joint name="j" type="hinge" axis="0 0 1" damping="0.3"/>'
+    "door": (True, 20 * 0.8**2 / 3 + 20 * 0.02**2 / 3, 0.0, 2.0, 1.2,
+             '<body pos="0 0 1"><joint name="j" type="hinge" axis="0 0 1" damping="2.0"/>'
              '<geom type="box" size="0.4 0.02 1" pos="0.4 0 0" mass="20"/></body>'),
     "flap": (True, 2 * 0.3**2 / 3 + 2 * 0.01**2 / 3, 2 * 9.81 * 0.15, 0.02, 2.5,
              '<body pos="0 0 1"><joint name="j" type="hinge" axis="0 1 0" damping="0.02"/>'
