@@ -60,7 +60,7 @@ def refused_joint(reason: str) -> dict:
 
 def number_origins(video: Video, fit: JointFit, geometry: Geometry, focal_given: bool) -> dict[str, dict]:
     """Provenance of the numbers that are neither the joint's nor assumed while writing the asset."""
-    focal_origin = "given" if focal_given else "observed" if video.focal_px else "assumed"
+    focal_origin = "given" if focal_given else "observed" if video.focal_px else "fitted"
     made = {
         "camera.focal_px": {"value": float(fit.K[0, 0]), "unit": "px", "origin": focal_origin,
                             "std": fit.std.get("focal_px")},

@@ -81,7 +81,7 @@ def fit_joint(
     dense = _all_frames(uv[found.members], camera, own, T)
     s = replace(s, q=np.interp(np.arange(T), own.frames, s.q))
     s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
-    std = joint_std(s, dense, focal_std)
+    std = joint_std(s, dense, focal_std) | {"focal_px": focal_std * full}
     tell(1.0)
     return _result(video, s, dense, found.members, full, found.probability, std, len(uv), note)
 
