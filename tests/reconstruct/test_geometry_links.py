@@ -113,8 +113,10 @@ def test_static_keeps_out_of_the_hands_way(door, door_geometry):
     cloud = middle + np.random.default_rng(0).normal(size=(6, 21, 3)) * 0.02
     made = build_geometry(scene.video, scene.hands, scene.tracks, scene.fit, masks, hand_points=cloud)
     for vertices, faces in made.static.parts:
-        inside = trimesh.Trimesh(vertices, faces, process=False).contains(cloud.reshape(-1, 3))
-        assert not inside.any()
+        # The parts are convex: a point is inside if it is behind every face.
+        part = trimesh.Trimesh(vertices, faces, process=False)
+        above = (cloud.reshape(-1, 1, 3) - part.triangles_center) * part.face_normals
+        assert (above.sum(-1).max(axis=1) > -1e-6).all()
 
 
 def test_a_slide_in_another_unit():
