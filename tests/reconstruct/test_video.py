@@ -133,7 +133,7 @@ def test_what_is_not_a_cut(tmp_path, what):
     else:
         for i in range(30):
             cv2.ellipse(frames[i], (-150 + 22 * i, 90), (110, 100), 0, 0, 360, (120, 150, 200), -1)
-    load_video(write(tmp_path / "uncut.mp4", frames))
+    assert len(load_video(write(tmp_path / "uncut.mp4", frames))) == 30
 
 
 def test_focal_length_from_metadata(plain, tmp_path):
