@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reconstruct.synth.clips import Clip, pose_matrix
+from reconstruct.synth.staging import Clip, pose_matrix
 
 FRAME_RATE = 30.0
 

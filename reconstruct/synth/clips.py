@@ -1,93 +1,16 @@
-"""What the clips show: an object, a hand that touches it somewhere, and a camera."""
+"""What the clips show; those on a desk are in :mod:`reconstruct.synth.desk_clips`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from reconstruct.synth import objects
-from reconstruct.synth.hand_model import RADII, THUMB_RADII, HandPose, landmarks
-from reconstruct.synth.objects import Model
-
-
-@dataclass(frozen=True)
-class Clip:
-    """One clip before it is rendered.
-
-    Attributes:
-        model: the object and its room.
-        pose, side: the hand's finger angles; "right" or "left".
-        T_world_hand: (4, 4) of the hand when contact begins (q = 0).
-        far, near: (3,) m, where the hand comes from, relative to the contact: it starts at ``far`` and arrives
-            along ``near``; when it leaves, both are turned with the moving link.
-        camera, target: (3,) camera position and what it looks at, world.
-        focal: focal length in units of the image's width.
-        drift: standard deviation of hand-held camera motion, (m, rad); zeros for a tripod.
-        frames: number of frames.  touches: whether the hand ever reaches the object.
-        free_path: pose (4, 4) of an unattached moving link for s in [0, 1].
-    """
-
-    name: str
-    story: str
-    model: Model
-    pose: HandPose
-    side: str
-    T_world_hand: np.ndarray
-    far: np.ndarray
-    near: np.ndarray
-    camera: np.ndarray
-    target: np.ndarray
-    focal: float = 0.82
-    drift: tuple[float, float] = (0.0, 0.0)
-    frames: int = 120
-    touches: bool = True
-    free_path: Callable[[float], np.ndarray] | None = None
-
-
-def pose_matrix(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(4, 4) from a rotation and a translation."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
-
-
-def skin_radii() -> np.ndarray:
-    """(21,) distance from each landmark to the skin, m."""
-    return np.concatenate([[0.018], THUMB_RADII, RADII.reshape(-1)])
-
-
-def place_hand(
-    pose: HandPose,
-    side: str,
-    palm: np.ndarray,
-    fingers: np.ndarray,
-    anchor: np.ndarray,
-    anchor_joints: tuple[int, ...],
-    surface: tuple[np.ndarray, np.ndarray],
-    touching: tuple[int, ...],
-) -> np.ndarray:
-    """(4, 4) world pose of a hand that touches a plane.
-
-    Args:
-        palm, fingers: (3,) where the palm faces and the metacarpals point, world.
-        anchor: (3,) where the mean of ``anchor_joints`` goes, before the shift below.
-        surface: point and unit normal (to the hand's side) of the touched plane.
-        touching: joints of which the nearest one's skin meets the plane.
-    """
-    y = np.asarray(fingers, float)
-    y = y / np.linalg.norm(y)
-    z = np.asarray(palm, float) - (palm @ y) * y
-    z /= np.linalg.norm(z)
-    R = np.stack([np.cross(y, z), y, z], axis=1)
-    joints = landmarks(pose, side) @ R.T
-    t = np.asarray(anchor, float) - joints[list(anchor_joints)].mean(0)
-    point, normal = surface
-    gap = ((joints + t - point) @ normal - skin_radii())[list(touching)].min()
-    # Skin gives way: the touching finger is pressed in by half a millimetre.
-    return pose_matrix(R, t - (gap + 0.0005) * normal)
+from reconstruct.synth import desk_clips, objects
+from reconstruct.synth.desk_clips import ANY_JOINT
+from reconstruct.synth.hand_model import HandPose
+from reconstruct.synth.staging import Clip, place_hand
 
 
 def _demo(seed: int) -> Clip:
@@ -108,7 +31,7 @@ def _demo(seed: int) -> Clip:
         np.array([0.085, 0, 0.585]),
         (12,),
         (np.array([0, -0.020, 0.0]), out),
-        tuple(range(21)),
+        ANY_JOINT,
     )
     opened = model.link_pose(np.radians(-75.0))
     turn = opened[:3, :3]
@@ -175,41 +98,6 @@ def _drawer(seed: int) -> Clip:
     )
 
 
-def _laptop(seed: int) -> Clip:
-    model = objects.laptop(seed)
-    pose = HandPose(
-        flex=((12, 14, 8), (12, 14, 8), (12, 14, 8), (14, 16, 8)),
-        spread=(11, 1, -8, -19),
-        thumb=(52, 8, 10, 8),
-        wrist=(0, 0),
-        arm=0.95,
-    )
-    up = np.array([0.0, 0, 1])
-    T = place_hand(
-        pose,
-        "right",
-        -up,
-        np.array([0.12, -0.97, -0.10]),
-        np.array([0.02, 0.115, 0.03]),
-        (12,),
-        (np.array([0, 0, 0.030]), up),
-        tuple(range(21)),
-    )
-    opened = model.link_pose(np.radians(-100.0))
-    return Clip(
-        "laptop",
-        "a laptop's lid is pushed shut from behind",
-        model,
-        pose,
-        "right",
-        opened @ T,
-        np.array([0.10, -0.16, 0.14]),
-        np.array([0.0, -0.08, 0.02]),
-        np.array([-0.28, -0.60, 0.42]),
-        np.array([0.01, 0.04, 0.13]),
-    )
-
-
 def _oven(seed: int) -> Clip:
     model = objects.oven(seed)
     pose = _hook(34, 45, 3, (8, 20))
@@ -228,42 +116,70 @@ def _oven(seed: int) -> Clip:
     )
 
 
-def _lifted(s: float) -> np.ndarray:
-    R = Rotation.from_rotvec(np.radians([28 * s, -22 * s * s, 55 * s * (1 - 0.4 * s)])).as_matrix()
-    return pose_matrix(R, np.array([0.11 * s * s, -0.07 * np.sin(np.pi * s), 0.17 * s * (1.5 - 0.5 * s)]))
-
-
-def _lift(seed: int) -> Clip:
-    model = objects.parcel(seed)
-    pose = HandPose(
-        flex=((46, 30, 14), (48, 30, 14), (48, 30, 14), (46, 30, 14)),
-        spread=(14, 2, -9, -22),
-        thumb=(62, 40, 0, 8),
-        wrist=(6, 0),
-    )
-    y = np.array([0.0, 1, 0])
+def _cabinet(seed: int) -> Clip:
+    model = objects.cabinet(seed)
+    # From below, palm up: the forearm leaves the picture without passing in front of the door.
+    pose = replace(_hook(44, 27, 3, (34, 0)), thumb=(66, -4, 8, 12))
+    # Turned a little to the hinge's far side, so that the short little finger does not pull alone.
+    rise, turn = np.radians([16.0, 14.0])
+    ahead = np.array([np.sin(turn), np.cos(turn), 0.0])
+    fingers = np.cos(rise) * ahead + np.array([0, 0, np.sin(rise)])
+    palm = -np.sin(rise) * ahead + np.array([0, 0, np.cos(rise)])
+    plate = np.array([0.115, -0.064, 0.382])
     T = place_hand(
         pose,
         "right",
-        np.array([0, -0.12, -1.0]),
-        np.array([0, 1, -0.12]),
-        np.array([0.0, 0.05, 0.134]),
-        (8, 12, 16, 20),
-        (np.array([0, 0.05, 0.0]), y),
-        (7, 8, 11, 12, 15, 16, 19, 20),
+        palm,
+        fingers,
+        plate + [-0.002, 0.009, 0.004],
+        (6, 7, 10, 11, 14, 15, 18, 19),
+        (plate, np.array([0.0, 1, 0])),
+        (6, 7, 8, 10, 11, 12, 14, 15, 16, 18, 19, 20),
     )
     return Clip(
-        "lift",
-        "a parcel is lifted freely away: no joint",
+        "cabinet",
+        "a wall cabinet's door is pulled open by its handle",
         model,
         pose,
         "right",
         T,
-        np.array([0.05, -0.14, 0.16]),
-        np.array([0.0, 0.0, 0.09]),
-        np.array([-0.26, -0.50, 0.72]),
-        np.array([0.03, 0.0, 0.14]),
-        free_path=_lifted,
+        np.array([0.06, -0.20, -0.16]),
+        np.array([0.0, 0.0, -0.10]),
+        np.array([-0.42, -0.96, 0.72]),
+        np.array([-0.02, -0.06, 0.51]),
+    )
+
+
+def _box(seed: int) -> Clip:
+    model = objects.chest(seed)
+    pose = HandPose(
+        flex=((10, 12, 8), (10, 12, 8), (10, 12, 8), (12, 14, 8)),
+        spread=(9, 1, -7, -16),
+        thumb=(58, 10, 8, 8),
+        wrist=(0, 0),
+    )
+    up = np.array([0.0, 0, 1])
+    T = place_hand(
+        pose,
+        "right",
+        up,
+        np.array([-0.10, 0.98, 0.10]),
+        np.array([0.025, -0.019, 0.12]),
+        (12,),
+        (np.array([0, 0, 0.132]), -up),
+        ANY_JOINT,
+    )
+    return Clip(
+        "box",
+        "a box's lid is lifted at its lip",
+        model,
+        pose,
+        "right",
+        T,
+        np.array([0.05, -0.16, -0.02]),
+        np.array([0.0, -0.02, -0.05]),
+        np.array([-0.60, 0.01, 0.68]),
+        np.array([0.02, 0.01, 0.19]),
     )
 
 
@@ -279,7 +195,7 @@ def _still(seed: int) -> Clip:
         np.array([0.05, 0, 0.30]),
         (9,),
         (np.array([0, -0.14, 0.0]), out),
-        tuple(range(21)),
+        ANY_JOINT,
     )
     return replace(
         clip,
@@ -296,9 +212,14 @@ def _still(seed: int) -> Clip:
 _BUILDERS: dict[str, Callable[[int], Clip]] = {
     "demo": _demo,
     "drawer": _drawer,
-    "laptop": _laptop,
+    "laptop": desk_clips.laptop,
     "oven": _oven,
-    "lift": _lift,
+    "monitor": desk_clips.monitor,
+    "stapler": desk_clips.stapler,
+    "puncher": desk_clips.puncher,
+    "cabinet": _cabinet,
+    "box": _box,
+    "lift": desk_clips.lift,
     "still": _still,
     "demo_handheld": _demo_handheld,
 }

@@ -79,12 +79,12 @@ class Model:
         return float(np.linalg.norm(np.ptp(corners, axis=0)))
 
 
-def _box(link: str, low: tuple, high: tuple, paint: tx.Painter, **kw) -> Box:
+def make_box(link: str, low: tuple, high: tuple, paint: tx.Painter, **kw) -> Box:
     low, high = np.asarray(low, float), np.asarray(high, float)
     return Box(link, (low + high) / 2, high - low, paint, **kw)
 
 
-def _opened(boxes: list[Box], kind: str, axis: np.ndarray, point: np.ndarray, q: float) -> list[Box]:
+def opened(boxes: list[Box], kind: str, axis: np.ndarray, point: np.ndarray, q: float) -> list[Box]:
     """The moving boxes turned by q: lets a model be written down in its closed state."""
     T = joint_transform(kind, axis, point, q)
     return [b.moved(T) if b.link == "moving" else b for b in boxes]
@@ -95,9 +95,9 @@ def room(seed: int, wall_y: float) -> list[Box]:
     rng = np.random.default_rng(seed)
     wall = tx.with_stickers(tx.plaster((0.80, 0.77, 0.70)), 22, 0.22)
     out = [
-        _box("room", (-3.0, -1.2, -0.04), (3.0, wall_y, 0.0), tx.wood((0.50, 0.36, 0.24), 0.22), density=400),
-        _box("room", (-3.0, wall_y, -0.1), (3.0, wall_y + 0.05, 0.30), tx.tiles((0.70, 0.76, 0.78)), density=400),
-        _box("room", (-3.0, wall_y + 0.01, 0.30), (3.0, wall_y + 0.05, 1.9), wall, density=300),
+        make_box("room", (-3.0, -1.2, -0.04), (3.0, wall_y, 0.0), tx.wood((0.50, 0.36, 0.24), 0.22), density=400),
+        make_box("room", (-3.0, wall_y, -0.1), (3.0, wall_y + 0.05, 0.30), tx.tiles((0.70, 0.76, 0.78)), density=400),
+        make_box("room", (-3.0, wall_y + 0.01, 0.30), (3.0, wall_y + 0.05, 1.9), wall, density=300),
     ]
     for x in (-0.62, 0.60):
         z = 0.0
@@ -105,9 +105,8 @@ def room(seed: int, wall_y: float) -> list[Box]:
             h, w, d = rng.uniform(0.03, 0.05), rng.uniform(0.13, 0.2), rng.uniform(0.14, 0.18)
             x0, y0 = x + rng.uniform(-0.02, 0.02) - w / 2, wall_y - 0.05 - d
             colour = tuple(rng.uniform(0.2, 0.75, 3))
-            out.append(
-                _box("room", (x0, y0, z), (x0 + w, y0 + d, z + h), tx.with_stickers(tx.paint(colour, 0.04), 2, 0.05))
-            )
+            book = tx.with_stickers(tx.paint(colour, 0.04), 2, 0.05)
+            out.append(make_box("room", (x0, y0, z), (x0 + w, y0 + d, z + h), book))
             z += h
     return out
 
@@ -117,15 +116,16 @@ def _cabinet(low: tuple, high: tuple, wall: float, paint: tx.Painter, shelves: i
     (x0, y0, z0), (x1, y1, z1) = low, high
     inner = tx.paint((0.74, 0.70, 0.62), 0.03)
     out = [
-        _box("static", (x0, y0, z0), (x0 + wall, y1, z1), paint),
-        _box("static", (x1 - wall, y0, z0), (x1, y1, z1), paint),
-        _box("static", (x0 + wall, y0, z0), (x1 - wall, y1, z0 + wall), paint),
-        _box("static", (x0 + wall, y0, z1 - wall), (x1 - wall, y1, z1), paint),
-        _box("static", (x0 + wall, y1 - wall, z0 + wall), (x1 - wall, y1, z1 - wall), inner),
+        make_box("static", (x0, y0, z0), (x0 + wall, y1, z1), paint),
+        make_box("static", (x1 - wall, y0, z0), (x1, y1, z1), paint),
+        make_box("static", (x0 + wall, y0, z0), (x1 - wall, y1, z0 + wall), paint),
+        make_box("static", (x0 + wall, y0, z1 - wall), (x1 - wall, y1, z1), paint),
+        make_box("static", (x0 + wall, y1 - wall, z0 + wall), (x1 - wall, y1, z1 - wall), inner),
     ]
     for k in range(shelves):
         z = z0 + (k + 1) * (z1 - z0) / (shelves + 1)
-        out.append(_box("static", (x0 + wall, y0 + 0.012, z - wall / 2), (x1 - wall, y1 - wall, z + wall / 2), paint))
+        low, high = (x0 + wall, y0 + 0.012, z - wall / 2), (x1 - wall, y1 - wall, z + wall / 2)
+        out.append(make_box("static", low, high, paint))
     return out
 
 
@@ -134,17 +134,18 @@ def cupboard(seed: int) -> Model:
     body = tx.wood((0.62, 0.45, 0.30), 0.15)
     front = tx.with_stickers(tx.wood((0.66, 0.50, 0.34), 0.22, upright=True), 7, 0.065)
     boxes = room(seed, 0.24) + _cabinet((-0.18, 0.0, 0.30), (0.18, 0.24, 0.72), 0.016, body)
-    boxes.append(_box("moving", (-0.18, -0.020, 0.302), (0.178, -0.002, 0.718), front, density=1400))
-    boxes.append(_box("moving", (0.135, -0.036, 0.655), (0.15, -0.020, 0.695), tx.paint((0.25, 0.25, 0.27)), shine=0.6))
+    boxes.append(make_box("moving", (-0.18, -0.020, 0.302), (0.178, -0.002, 0.718), front, density=1400))
+    knob = tx.paint((0.25, 0.25, 0.27))
+    boxes.append(make_box("moving", (0.135, -0.036, 0.655), (0.15, -0.020, 0.695), knob, shine=0.6))
     for z in (0.42, 0.60):
         for k, colour in enumerate(((0.7, 0.3, 0.2), (0.3, 0.5, 0.35), (0.75, 0.65, 0.3))):
             x = -0.12 + 0.09 * k
             jar = tx.with_stickers(tx.paint(colour, 0.05), 1, 0.04)
             low = (x, 0.09, 0.316 if z < 0.5 else 0.518)
-            boxes.append(_box("static", low, (x + 0.06, 0.15, low[2] + 0.11), jar))
+            boxes.append(make_box("static", low, (x + 0.06, 0.15, low[2] + 0.11), jar))
     axis, point, start = np.array([0.0, 0, 1]), np.array([-0.18, -0.002, 0.51]), np.radians(-75.0)
     return Model(
-        tuple(_opened(boxes, "revolute", axis, point, start)),
+        tuple(opened(boxes, "revolute", axis, point, start)),
         "revolute",
         axis,
         point,
@@ -161,60 +162,27 @@ def drawers(seed: int) -> Model:
     x, depth, height = 0.22, 0.30, 0.34
     boxes = room(seed, depth + 0.02) + _cabinet((-x, 0.0, 0.0), (x, depth, height), 0.016, body, shelves=1)
     boxes.append(
-        _box("static", (-x + 0.003, -0.018, 0.004), (x - 0.003, 0.0, 0.167), tx.wood((0.55, 0.40, 0.27), 0.18))
+        make_box("static", (-x + 0.003, -0.018, 0.004), (x - 0.003, 0.0, 0.167), tx.wood((0.55, 0.40, 0.27), 0.18))
     )
     z0, z1 = 0.171, height - 0.004
-    boxes.append(_box("moving", (-x + 0.003, -0.018, z0), (x - 0.003, -0.001, z1), front, density=1300))
+    boxes.append(make_box("moving", (-x + 0.003, -0.018, z0), (x - 0.003, -0.001, z1), front, density=1300))
     inside = 0.024
     for s in (-1, 1):
         a, b = sorted((s * (x - inside), s * (x - inside - 0.01)))
-        boxes.append(_box("moving", (a, -0.001, z0 + 0.014), (b, 0.26, z1 - 0.03), plain))
-    boxes.append(_box("moving", (-x + inside, -0.001, z0 + 0.010), (x - inside, 0.26, z0 + 0.016), plain))
-    boxes.append(_box("moving", (-x + inside, 0.25, z0 + 0.014), (x - inside, 0.26, z1 - 0.03), plain))
+        boxes.append(make_box("moving", (a, -0.001, z0 + 0.014), (b, 0.26, z1 - 0.03), plain))
+    boxes.append(make_box("moving", (-x + inside, -0.001, z0 + 0.010), (x - inside, 0.26, z0 + 0.016), plain))
+    boxes.append(make_box("moving", (-x + inside, 0.25, z0 + 0.014), (x - inside, 0.26, z1 - 0.03), plain))
     for k, colour in enumerate(((0.8, 0.75, 0.6), (0.35, 0.45, 0.6), (0.7, 0.35, 0.3))):
         u = -0.16 + 0.11 * k
         stuff = tx.with_stickers(tx.paint(colour, 0.05), 2, 0.05)
-        boxes.append(_box("moving", (u, 0.03, z0 + 0.016), (u + 0.09, 0.15, z0 + 0.075), stuff))
+        boxes.append(make_box("moving", (u, 0.03, z0 + 0.016), (u + 0.09, 0.15, z0 + 0.075), stuff))
     z = 0.5 * (z0 + z1) + 0.01
-    boxes.append(_box("moving", (-0.085, -0.074, z - 0.016), (0.085, -0.064, z + 0.016), metal, shine=0.6))
+    boxes.append(make_box("moving", (-0.085, -0.074, z - 0.016), (0.085, -0.064, z + 0.016), metal, shine=0.6))
     for s in (-1, 1):
         boxes.append(
-            _box("moving", (s * 0.078 - 0.006, -0.064, z - 0.006), (s * 0.078 + 0.006, -0.018, z + 0.006), metal)
+            make_box("moving", (s * 0.078 - 0.006, -0.064, z - 0.006), (s * 0.078 + 0.006, -0.018, z + 0.006), metal)
         )
     return Model(tuple(boxes), "prismatic", np.array([0.0, -1, 0]), None, 0.18, (0.0, 0.22))
-
-
-def laptop(seed: int) -> Model:
-    """A laptop seen from behind; its lid, opened by 100 deg, is pushed down to 10 deg (horizontal hinge)."""
-    shell = tx.paint((0.42, 0.43, 0.46), 0.03)
-    lid = tx.with_stickers(tx.paint((0.42, 0.43, 0.46), 0.03), 8, 0.055)
-    w, d, base = 0.17, 0.24, 0.018
-    boxes = room(seed, 1.35) + [_box("static", (-w, 0.0, 0.004), (w, d, base), shell, shine=0.4)]
-    boxes += [
-        _box(
-            "static",
-            (-w + 0.02, 0.03, base),
-            (w - 0.02, 0.14, base + 0.002),
-            tx.tiles((0.1, 0.1, 0.1), 0.018),
-            density=1500,
-        )
-    ]
-    boxes += [
-        _box("static", (sx - 0.01, sy - 0.01, 0.0), (sx + 0.01, sy + 0.01, 0.004), shell)
-        for sx in (-0.15, 0.15)
-        for sy in (0.02, 0.22)
-    ]
-    boxes.append(_box("moving", (-w, 0.004, base + 0.004), (w, d, base + 0.012), lid, density=1500, shine=0.4))
-    axis, point, start = np.array([1.0, 0, 0]), np.array([0.0, 0.0, base + 0.006]), np.radians(100.0)
-    # Closing turns the lid about -x; q grows as it closes.
-    return Model(
-        tuple(_opened(boxes, "revolute", axis, point, start)),
-        "revolute",
-        -axis,
-        point,
-        np.radians(90.0),
-        (0.0, np.radians(98.0)),
-    )
 
 
 def oven(seed: int) -> Model:
@@ -223,16 +191,16 @@ def oven(seed: int) -> Model:
     front = tx.with_stickers(tx.paint((0.60, 0.60, 0.59), 0.03), 5, 0.05)
     boxes = room(seed, 0.34) + _cabinet((-0.21, 0.0, 0.02), (0.21, 0.30, 0.36), 0.018, body, shelves=0)
     boxes += [
-        _box("static", (sx - 0.015, sy, 0.0), (sx + 0.015, sy + 0.03, 0.02), metal)
+        make_box("static", (sx - 0.015, sy, 0.0), (sx + 0.015, sy + 0.03, 0.02), metal)
         for sx in (-0.18, 0.18)
         for sy in (0.02, 0.25)
     ]
     boxes.append(
-        _box("static", (-0.21, -0.02, 0.302), (0.21, 0.0, 0.36), tx.with_stickers(body, 5, 0.045), density=1400)
+        make_box("static", (-0.21, -0.02, 0.302), (0.21, 0.0, 0.36), tx.with_stickers(body, 5, 0.045), density=1400)
     )
-    boxes.append(_box("moving", (-0.208, -0.020, 0.024), (0.208, -0.001, 0.298), front, density=1300))
+    boxes.append(make_box("moving", (-0.208, -0.020, 0.024), (0.208, -0.001, 0.298), front, density=1300))
     boxes.append(
-        _box(
+        make_box(
             "moving",
             (-0.15, -0.0215, 0.06),
             (0.15, -0.020, 0.215),
@@ -242,10 +210,10 @@ def oven(seed: int) -> Model:
         )
     )
     z = 0.262
-    boxes.append(_box("moving", (-0.10, -0.076, z - 0.016), (0.10, -0.066, z + 0.016), metal, shine=0.6))
+    boxes.append(make_box("moving", (-0.10, -0.076, z - 0.016), (0.10, -0.066, z + 0.016), metal, shine=0.6))
     for s in (-1, 1):
         boxes.append(
-            _box("moving", (s * 0.094 - 0.006, -0.066, z - 0.006), (s * 0.094 + 0.006, -0.020, z + 0.006), metal)
+            make_box("moving", (s * 0.094 - 0.006, -0.066, z - 0.006), (s * 0.094 + 0.006, -0.020, z + 0.006), metal)
         )
     return Model(
         tuple(boxes),
@@ -257,11 +225,45 @@ def oven(seed: int) -> Model:
     )
 
 
-def parcel(seed: int) -> Model:
-    """A parcel that stands on a table, not attached to anything."""
-    carton = tx.with_stickers(tx.paint((0.66, 0.50, 0.33), 0.05), 3, 0.055)
-    boxes = room(seed, 0.40) + [_box("moving", (-0.055, -0.07, 0.0), (0.085, 0.05, 0.16), carton, density=1500)]
-    boxes.append(
-        _box("static", (-0.22, 0.12, 0.0), (0.24, 0.26, 0.11), tx.with_stickers(tx.wood((0.5, 0.36, 0.25)), 4, 0.06))
-    )
-    return Model(tuple(boxes), None, None, None, 1.0, (0.0, 1.0))
+def cabinet(seed: int) -> Model:
+    """A wall cabinet whose door is pulled open by 60 deg at a plate handle near its lower edge (vertical hinge)."""
+    body = tx.wood((0.52, 0.42, 0.30), 0.14)
+    front = tx.with_stickers(tx.wood((0.58, 0.47, 0.34), 0.18, upright=True), 6, 0.06)
+    metal = tx.paint((0.28, 0.28, 0.30))
+    boxes = room(seed, 0.24) + _cabinet((-0.19, 0.0, 0.34), (0.19, 0.23, 0.74), 0.016, body)
+    boxes.append(make_box("moving", (-0.19, -0.020, 0.342), (0.188, -0.002, 0.738), front, density=1400))
+    x, z = 0.115, 0.382
+    boxes.append(make_box("moving", (x - 0.062, -0.074, z - 0.014), (x + 0.062, -0.064, z + 0.014), metal, shine=0.6))
+    for s in (-1, 1):
+        low, high = (x + s * 0.056 - 0.006, -0.064, z - 0.006), (x + s * 0.056 + 0.006, -0.020, z + 0.006)
+        boxes.append(make_box("moving", low, high, metal))
+    for k, colour in enumerate(((0.65, 0.35, 0.25), (0.30, 0.45, 0.50), (0.70, 0.62, 0.35))):
+        jar = tx.with_stickers(tx.paint(colour, 0.05), 1, 0.04)
+        low = (-0.14 + 0.10 * k, 0.08, 0.548)
+        boxes.append(make_box("static", low, (low[0] + 0.065, 0.15, low[2] + 0.12), jar))
+    # Opening turns the free edge towards the viewer: about -z.
+    axis, point = np.array([0.0, 0, -1]), np.array([-0.19, -0.002, 0.54])
+    return Model(tuple(boxes), "revolute", axis, point, np.radians(60.0), (0.0, np.radians(95.0)))
+
+
+def chest(seed: int) -> Model:
+    """A box whose lid, hinged at the back, is lifted by 50 deg at the lip in front (horizontal hinge)."""
+    side = tx.with_stickers(tx.wood((0.48, 0.33, 0.21), 0.16), 2, 0.05)
+    inner = tx.paint((0.62, 0.56, 0.46), 0.03)
+    top = tx.with_stickers(tx.wood((0.56, 0.40, 0.26), 0.20), 9, 0.055)
+    w, d, h, wall = 0.15, 0.20, 0.13, 0.010
+    boxes = room(seed, 0.55) + [
+        make_box("static", (-w, 0.0, 0.0), (w, wall, h), side),
+        make_box("static", (-w, d - wall, 0.0), (w, d, h), side),
+        make_box("static", (-w, wall, 0.0), (-w + wall, d - wall, h), side),
+        make_box("static", (w - wall, wall, 0.0), (w, d - wall, h), side),
+        make_box("static", (-w + wall, wall, 0.0), (w - wall, d - wall, wall), inner),
+    ]
+    for k, colour in enumerate(((0.75, 0.30, 0.25), (0.30, 0.50, 0.60), (0.80, 0.70, 0.35))):
+        x = -0.11 + 0.08 * k
+        packet = tx.with_stickers(tx.paint(colour, 0.05), 2, 0.03)
+        boxes.append(make_box("static", (x, 0.06, wall), (x + 0.055, 0.14, 0.07), packet))
+    boxes.append(make_box("moving", (-w, -0.030, h + 0.002), (w, d, h + 0.018), top, density=1500))
+    # Lifting the front edge turns the lid about -x.
+    axis, point = np.array([-1.0, 0, 0]), np.array([0.0, d - 0.004, h + 0.004])
+    return Model(tuple(boxes), "revolute", axis, point, np.radians(50.0), (0.0, np.radians(100.0)))

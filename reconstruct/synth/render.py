@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.errors import TaaError
 from reconstruct.synth.animation import Motion
-from reconstruct.synth.clips import Clip
 from reconstruct.synth.hand_model import HandMesh, build_hand
 from reconstruct.synth.objects import Box
+from reconstruct.synth.staging import Clip
 
 LINK_CODE = {"none": 0, "room": 1, "static": 2, "moving": 3, "hand": 4}
 FACES = [(0, 1), (0, -1), (1, 1), (1, -1), (2, 1), (2, -1)]

@@ -10,10 +10,10 @@ import numpy as np
 
 from reconstruct.joint.models import joint_transform
 from reconstruct.synth.animation import Motion
-from reconstruct.synth.clips import Clip
 from reconstruct.synth.hand_model import landmarks
 from reconstruct.synth.objects import Model
 from reconstruct.synth.render import LINK_CODE, Rendered
+from reconstruct.synth.staging import Clip
 
 DEPTH_STRIDE = 3
 """Stored depth is sampled at pixels (3 i + 1): the centre of each 3 x 3 block, so it is the picture at scale 1/3."""

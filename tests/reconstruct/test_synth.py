@@ -11,12 +11,13 @@ from scipy.spatial import ConvexHull
 
 from reconstruct.synth import list_clips, load_truth, render_clip, render_clips, write_cues
 from reconstruct.synth.animation import animate
-from reconstruct.synth.clips import build_clip, skin_radii
+from reconstruct.synth.clips import build_clip
 from reconstruct.synth.hand_model import FLAT, HandPose, _Skin, build_hand, landmarks
+from reconstruct.synth.staging import skin_radii
 from reconstruct.synth.truth import write_mjcf
 
 SIZE = (240, 136)
-JOINTED = ["demo", "drawer", "laptop", "oven"]
+JOINTED = ["demo", "drawer", "laptop", "oven", "monitor", "stapler", "puncher", "cabinet", "box"]
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +187,8 @@ def replay(path, joints):
     spec.option.timestep, spec.option.gravity = 0.002, [0, 0, 0]
     for k in range(21):
         body = spec.worldbody.add_body(name=f"hand{k}", mocap=True, pos=joints[0, k])
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.007, 0, 0])
+        # Stiff: MuJoCo takes a mocap body for standing, so that the part it drives sinks in by speed x time constant.
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.007, 0, 0], solref=[0.004, 1.0], priority=1)
     model = spec.compile()
     assert model.nu == 0 and model.nv == 1
     data = mujoco.MjData(model)
