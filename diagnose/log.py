@@ -11,6 +11,7 @@ import numpy as np
 from taa_envs.errors import TaaEnvsError
 
 MIN_SAMPLES = 20
+MAX_BYTES = 256 << 20
 FORCE_COLUMNS = ("force_x", "force_y", "force_z", "point_x", "point_y", "point_z")
 
 
@@ -79,6 +80,8 @@ def load_log(path: Path | str) -> JointLog:
     path = Path(path)
     if not path.is_file():
         raise LogError(f"no such log: {path}; check the path")
+    if path.stat().st_size > MAX_BYTES:
+        raise LogError(f"{path} is larger than {MAX_BYTES >> 20} MiB; give one episode a file, thinned if need be")
     try:
         with path.open(newline="", encoding="utf-8-sig") as f:
             rows = csv.DictReader(f)
@@ -99,7 +102,7 @@ def load_log(path: Path | str) -> JointLog:
                 except (TypeError, ValueError):
                     raise LogError(f"{path}, line {rows.line_num}: {', '.join(wanted)} must be numbers; mend that row"
                                    ) from None  # fmt: skip
-    except UnicodeDecodeError:
+    except (UnicodeDecodeError, csv.Error):
         raise LogError(f"{path} is no text file; a joint log is a CSV with the columns time and q") from None
     values = np.array(table, dtype=float).reshape(-1, len(wanted))
     column = {c: values[:, i] for i, c in enumerate(wanted)}

@@ -6,8 +6,8 @@ not as the pipeline wrote it was put there by somebody, and is used as if a prov
 
 from __future__ import annotations
 
+import io
 import json
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +15,28 @@ from typing import Any
 
 import numpy as np
 
+from reconstruct.container import MAX_SIDE, MIN_SIDE
 from reconstruct.cues import HandReference, Hands, HandTrack, LinkMasks, ProviderInfo, Tracks
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.joint.models import JointFit
 from reconstruct.store import file_digest, save_npz
 from reconstruct.video import WORK_LONG_SIDE, Video
+from taa_envs.arrays import ArrayFileError, read_npz
 from taa_envs.files import written_whole
 
 GIVEN = ProviderInfo("given", "scene folder", "the user's")
 NAMES = ("frames", "camera", "depth", "masks", "tracks", "hand")
 MESHES = ("meshes/static.glb", "meshes/moving.glb")
+
+MAX_CUE_BYTES = 4 << 30
+"""Of one cue once unpacked: depth of 900 frames at 960 x 540 takes 1.9 GB, as many masks of three kinds 1.4 GB."""
+MAX_MESH_BYTES = 128 << 20
+MAX_FACES = 2_000_000
+MAX_DEPTH = 1e4
+"""m; other depths, like those that are not positive, are taken as unknown."""
+MAX_PX = 1e5
+"""Farther out no point of a picture is tracked: a track is taken as not visible there."""
 
 HAND_ARRAYS = ("joints_world", "joints_uv", "valid", "side")
 
@@ -43,9 +54,10 @@ class CueFolder:
         self.folder = Path(scene) / "cues"
         self._ledger_file = self.folder / "written.json"
         try:
-            self._written: dict[str, str] = json.loads(self._ledger_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            self._written = {}
+            ledger = json.loads(self._ledger_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            ledger = None
+        self._written: dict[str, str] = ledger if isinstance(ledger, dict) else {}
 
     def given(self) -> dict[str, str]:
         """Name (``"tracks"``, ``"meshes/moving.glb"``) -> sha256 of every cue that the pipeline did not write."""
@@ -64,10 +76,10 @@ class CueFolder:
         """
         file = self._file(name)
         try:
-            with np.load(file, allow_pickle=False) as data:
-                arrays = {key: data[key] for key in data.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise TaaError(f"cannot read {file} ({str(error)[:80]}); write it with numpy.savez or remove it") from None
+            arrays = read_npz(file, max_bytes=MAX_CUE_BYTES)
+        except (OSError, ArrayFileError) as error:
+            reason = str(error).replace(f"{file}", "").strip(" ,")[:120]
+            raise TaaError(f"cannot read {file} ({reason}); write it with numpy.savez or remove it") from None
         missing = [key for key in required if key not in arrays]
         if missing:
             raise TaaError(f"{file} has no array {missing[0]!r}; it needs {', '.join(required)}")
@@ -116,11 +128,53 @@ def expect_shape(array: np.ndarray, shape: tuple[int | None, ...], what: str) ->
     return array
 
 
+def numbers(array: np.ndarray, shape: tuple[int | None, ...], what: str, finite: bool = False) -> np.ndarray:
+    """The array as floats, of that shape; with ``finite`` without NaN or infinity.
+
+    Raises:
+        TaaError: it is not so.
+    """
+    if array.dtype.kind not in "biuf":
+        raise TaaError(f"{what} does not hold numbers; write it as an array of floats")
+    array = expect_shape(np.asarray(array, float), shape, what)
+    if finite and not np.isfinite(array).all():
+        raise TaaError(f"{what} holds numbers that are not finite; mend or remove the file")
+    return array
+
+
+def poses(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.ndarray:
+    """Rigid transforms (..., 4, 4).
+
+    Raises:
+        TaaError: not numbers, of another shape, or not a rotation and a shift.
+    """
+    array = numbers(array, shape, what, finite=True)
+    if (np.abs(array) > 1e6).any():
+        raise TaaError(f"{what} lies farther away than a million units; give metres")
+    R = array[..., :3, :3]
+    if (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) > 1e-3).any() or (np.linalg.det(R) < 0).any():
+        raise TaaError(f"{what} is not a rotation and a shift; give camera-to-world poses, right, down, forward")
+    return array
+
+
+def booleans(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.ndarray:
+    """The array as truth values.
+
+    Raises:
+        TaaError: it does not hold numbers or is of another shape.
+    """
+    if array.dtype.kind not in "biuf":
+        raise TaaError(f"{what} does not hold truth values; write it as an array of bool")
+    return expect_shape(np.asarray(array, bool), shape, what)
+
+
 def tracks_from_cue(cue: Arrays, frames: int) -> Tracks:
     """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T)); seeded where first visible."""
-    uv = expect_shape(np.asarray(cue["uv"], float), (None, frames, 2), "uv of cues/tracks.npz")
-    visible = expect_shape(np.asarray(cue["visible"], bool), uv.shape[:2], "visible of cues/tracks.npz")
-    visible = visible & np.isfinite(uv).all(-1)
+    uv = numbers(cue["uv"], (None, frames, 2), "uv of cues/tracks.npz")
+    if not len(uv):
+        raise TaaError("cues/tracks.npz holds no track; remove it and the pipeline tracks points itself")
+    visible = booleans(cue["visible"], uv.shape[:2], "visible of cues/tracks.npz")
+    visible = visible & (np.abs(np.nan_to_num(uv, nan=np.inf)) < MAX_PX).all(-1)
     uv = np.where(visible[..., None], uv, np.nan)
     return Tracks(uv.astype(np.float32), visible, visible.argmax(1), GIVEN)
 
@@ -139,11 +193,15 @@ def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.nd
     T = len(video)
     if camera is None or "T_world_camera" not in camera:
         raise TaaError("cues/hand.npz is in the world frame; put the camera's poses into cues/camera.npz too")
-    pose = expect_shape(np.asarray(camera["T_world_camera"], float), (T, 4, 4), "T_world_camera of cues/camera.npz")
-    joints = expect_shape(np.asarray(cue["joints_world"], float), (T, 21, 3), "joints_world of cues/hand.npz")
-    uv = expect_shape(np.asarray(cue["joints_uv"], float), (T, 21, 2), "joints_uv of cues/hand.npz")
-    valid = expect_shape(np.asarray(cue["valid"], bool), (T,), "valid of cues/hand.npz")
-    valid = valid & np.isfinite(joints).all((1, 2)) & np.isfinite(uv).all((1, 2))
+    pose = poses(camera["T_world_camera"], (T, 4, 4), "T_world_camera of cues/camera.npz")
+    joints = numbers(cue["joints_world"], (T, 21, 3), "joints_world of cues/hand.npz")
+    uv = numbers(cue["joints_uv"], (T, 21, 2), "joints_uv of cues/hand.npz")
+    valid = booleans(cue["valid"], (T,), "valid of cues/hand.npz")
+    valid = valid & (np.abs(np.nan_to_num(joints, nan=np.inf)) < 1e6).all((1, 2))
+    valid &= (np.abs(np.nan_to_num(uv, nan=np.inf)) < MAX_PX).all((1, 2))
+    if cue["side"].ndim or str(cue["side"]) not in ("left", "right"):
+        raise TaaError('side of cues/hand.npz must be "left" or "right"')
+    joints = np.where(valid[:, None, None], joints, 0.0)
     centred = joints - joints.mean(axis=1, keepdims=True)
     metric = np.einsum("tji,tkj->tki", pose[:, :3, :3], centred)
     nan = np.where(valid, 1.0, np.nan)[:, None, None]
@@ -166,10 +224,27 @@ def mask_at_work_size(mask: np.ndarray, video: Video, name: str) -> np.ndarray:
     import cv2
 
     T, h, w = video.frames.shape[:3]
-    mask = expect_shape(np.asarray(mask, bool), (T, None, None), f"{name} of cues/masks.npz")
+    mask = booleans(mask, (T, None, None), f"{name} of cues/masks.npz")
+    if not mask.size:
+        raise TaaError(f"{name} of cues/masks.npz has no pixels; give masks of the video's shape")
     if mask.shape == (T, h, w):
         return mask
     return np.stack([cv2.resize(m.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0 for m in mask])
+
+
+def metric_depth_from_cue(cue: Arrays, frames: int) -> np.ndarray | None:
+    """(T, H, W) float32 m, NaN where unknown, of ``depth.npz``; None where it is not metric.
+
+    Raises:
+        TaaError: not numbers, or of another shape.
+    """
+    if not booleans(cue.get("metric", np.array(True)), (), "metric of cues/depth.npz"):
+        return None
+    if cue["depth"].dtype.kind not in "iuf" or not cue["depth"].size:
+        raise TaaError("depth of cues/depth.npz does not hold numbers; write metres as float32")
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = expect_shape(np.asarray(cue["depth"], np.float32), (frames, None, None), "depth of cues/depth.npz")
+        return np.where((depth > 0) & (depth < MAX_DEPTH), depth, np.float32(np.nan))
 
 
 def meshes_from_cue(folder: Path, names: Iterable[str] = MESHES) -> dict[str, LinkMesh]:
@@ -178,41 +253,66 @@ def meshes_from_cue(folder: Path, names: Iterable[str] = MESHES) -> dict[str, Li
     Raises:
         TaaError: a file is not a mesh.
     """
-    import trimesh
-
-    from reconstruct.geometry.collision import convex_parts
+    from reconstruct.geometry.given import bounded_parts
 
     links = {}
     for name in names:
-        file = folder / name
-        try:
-            mesh: Any = trimesh.load(file, force="mesh", process=False)
-            visual = mesh.visual
-            colours = np.asarray((visual.to_color() if visual.kind == "texture" else visual).vertex_colors, np.uint8)
-        except Exception as error:  # trimesh raises whatever its readers raise
-            raise TaaError(f"cannot read the mesh {file} ({str(error)[:80]}); export it as binary glTF") from error
-        if len(mesh.faces) == 0:
-            raise TaaError(f"{file} holds no faces; export a surface")
-        if colours.shape != (len(mesh.vertices), 4):
-            colours = np.tile(np.uint8([160, 160, 160, 255]), (len(mesh.vertices), 1))
-        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-        parts, _ = convex_parts(vertices, faces)
-        links[Path(name).stem] = LinkMesh(vertices, faces, colours, np.zeros(len(faces), bool), tuple(parts))
+        vertices, faces, colours = read_mesh(folder / name)
+        parts = bounded_parts(vertices, faces)
+        links[Path(name).stem] = LinkMesh(vertices, faces, colours, np.zeros(len(faces), bool), parts)
     return links
+
+
+def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3), faces (F, 3) and colours (V, 4) uint8 of a binary glTF file; reads no other file.
+
+    Raises:
+        TaaError: it is not a mesh, or one of impossible size.
+    """
+    import trimesh
+
+    try:
+        if file.stat().st_size > MAX_MESH_BYTES:
+            raise ValueError(f"larger than {MAX_MESH_BYTES >> 20} MiB")
+        # From bytes: a mesh that names pictures or buffers in other files gets none of them.
+        raw = io.BytesIO(file.read_bytes())
+        mesh: Any = trimesh.load(raw, file_type="glb", force="mesh", process=False)
+        visual = mesh.visual
+        colours = np.asarray((visual.to_color() if visual.kind == "texture" else visual).vertex_colors, np.uint8)
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    except Exception as error:  # trimesh raises whatever its readers raise
+        raise TaaError(f"cannot read the mesh {file} ({str(error)[:80]}); export it as binary glTF") from error
+    if not len(faces):
+        raise TaaError(f"{file} holds no faces; export a surface")
+    if len(faces) > MAX_FACES or faces.min() < 0 or faces.max() >= len(vertices):
+        raise TaaError(f"{file} has more than {MAX_FACES} faces or faces without corners; export a smaller surface")
+    if not (np.isfinite(vertices).all() and np.abs(vertices).max() < 1e6):
+        raise TaaError(f"{file} has corners that are not finite or too far away; export it in metres")
+    if not np.ptp(vertices[faces.ravel()], axis=0).min() > 0:
+        raise TaaError(f"{file} is flat; export a surface with a thickness")
+    if colours.shape != (len(vertices), 4):
+        colours = np.tile(np.uint8([160, 160, 160, 255]), (len(vertices), 1))
+    return vertices, faces, colours
 
 
 def focal_of(camera: Arrays) -> float:
     """Focal length in full px of ``camera.npz``: the mean of both axes in the first frame."""
-    K = np.asarray(camera["K"], float)
-    if K.shape[-2:] != (3, 3) or K.ndim not in (2, 3) or not np.isfinite(K).all():
-        raise TaaError(f"K of cues/camera.npz has shape {K.shape}, expected (3, 3) or (T, 3, 3)")
-    first = K.reshape(-1, 3, 3)[0]
-    return float((first[0, 0] + first[1, 1]) / 2)
+    focal = float(np.diag(_first_K(camera))[:2].mean())
+    if not 1.0 <= focal <= 1e6:
+        raise TaaError(f"K of cues/camera.npz has a focal length of {focal:.4g} px; give pixels of the full-size frame")
+    return focal
+
+
+def _first_K(camera: Arrays) -> np.ndarray:
+    K = camera["K"]
+    return numbers(K, (3, 3) if K.ndim == 2 else (None, 3, 3), "K of cues/camera.npz", finite=True).reshape(-1, 3, 3)[0]
 
 
 def in_world_of(fit: JointFit, camera: Arrays) -> JointFit:
     """The same joint in the world in which the user's camera (its first frame) stands."""
-    T_world_camera = np.asarray(camera["T_world_camera"], float).reshape(-1, 4, 4)[0]
+    T = camera["T_world_camera"]
+    shape = (4, 4) if T.ndim == 2 else (None, 4, 4)
+    T_world_camera = poses(T, shape, "T_world_camera of cues/camera.npz").reshape(-1, 4, 4)[0]
     T_new_old = T_world_camera @ np.asarray(fit.T_camera_world, float)
     R, t = T_new_old[:3, :3], T_new_old[:3, 3]
     return replace(
@@ -250,20 +350,31 @@ def video_of_cues(scene: Path) -> Video:
         TaaError: the size is nowhere to be found, or the times do not fit the tracks.
     """
     folder = CueFolder(scene)
-    count = folder.read("tracks", "uv")["uv"].shape[1]
+    count = expect_shape(folder.read("tracks", "uv")["uv"], (None, None, 2), "uv of cues/tracks.npz").shape[1]
+    if count < 2:
+        raise TaaError(f"{folder.folder}/tracks.npz holds {count} frames; tracks need at least two")
     time = np.arange(count) / 30.0
     if (folder.folder / "frames.npz").is_file():
-        given = np.asarray(folder.read("frames", "time")["time"], float)
-        time = expect_shape(given, (count,), "time of cues/frames.npz")
+        time = numbers(folder.read("frames", "time")["time"], (count,), "time of cues/frames.npz", finite=True)
+        if not (np.diff(time) > 0).all():
+            raise TaaError("time of cues/frames.npz does not increase; give the time of every frame, s")
     try:
         facts = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
-        size, index = tuple(facts["size"]), np.asarray(facts["index"], int)
-        name, sha, decoded, focal = facts["video"], facts["sha256"], facts["decoded"], facts["focal_px"]
-    except (OSError, ValueError, KeyError, TypeError):
+        width, height = facts["size"]
+        size, index = (int(width), int(height)), np.asarray(facts["index"], int)
+        name, sha, decoded = str(facts["video"]), str(facts["sha256"]), int(facts["decoded"])
+        focal = None if facts["focal_px"] is None else float(facts["focal_px"])
+    except FileNotFoundError:
         size, index = _size_of_cues(folder), np.arange(count)
         name, sha, decoded, focal = "cues", "", count, None
-    if len(index) != count:
-        raise TaaError(f"{scene}/scene.json has {len(index)} frames, cues/tracks.npz {count}; remove scene.json")
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise TaaError(f"{scene}/scene.json cannot be used ({str(error)[:80]}); remove it") from None
+    if not (MIN_SIDE <= min(size) and max(size) <= MAX_SIDE):
+        raise TaaError(f"a picture of {size[0]} x {size[1]} px is not possible; mend scene.json, masks or camera")
+    if focal is not None and not 1.0 <= focal <= 1e6:
+        raise TaaError(f"{scene}/scene.json has a focal length of {focal:.4g} px; remove it")
+    if index.shape != (count,):
+        raise TaaError(f"{scene}/scene.json has {index.size} frames, cues/tracks.npz {count}; remove scene.json")
     scale = min(1.0, WORK_LONG_SIDE / max(size))
     black = np.broadcast_to(np.uint8(0), (count, round(size[1] * scale), round(size[0] * scale), 3))
     return Video(Path(name), sha, (int(size[0]), int(size[1])), time, index, decoded, black, scale, focal)
@@ -271,10 +382,10 @@ def video_of_cues(scene: Path) -> Video:
 
 def _size_of_cues(folder: CueFolder) -> tuple[int, int]:
     if (folder.folder / "masks.npz").is_file():
-        shape = folder.read("masks", "moving")["moving"].shape
-        return shape[2], shape[1]
+        masks = expect_shape(folder.read("masks", "moving")["moving"], (None, None, None), "moving of cues/masks.npz")
+        return masks.shape[2], masks.shape[1]
     if (folder.folder / "camera.npz").is_file():
-        K = np.asarray(folder.read("camera", "K")["K"], float).reshape(-1, 3, 3)[0]
+        K = _first_K(folder.read("camera", "K"))
         return round(2 * K[0, 2] + 1), round(2 * K[1, 2] + 1)
     raise TaaError(f"the picture's size is unknown; put masks.npz or camera.npz into {folder.folder}")
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reconstruct.container import open_video
 from reconstruct.errors import TaaError
 from taa_envs.files import written_whole
 
@@ -72,10 +73,14 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float, crf: int = 
 
 
 def read_mp4(path: Path) -> Iterator[np.ndarray]:
-    """(h, w, 3) uint8 RGB frames of a film."""
+    """(h, w, 3) uint8 RGB frames of a film.
+
+    Raises:
+        TaaError: it cannot be decoded.
+    """
     import cv2
 
-    cap = cv2.VideoCapture(str(path))
+    cap = open_video(path)
     try:
         while True:
             ok, image = cap.read()

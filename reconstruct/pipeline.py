@@ -268,9 +268,8 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
 
     def scaled() -> JointFit:
         if folder is not None and "depth" in given:
-            cue = folder.read("depth", "depth")
-            if bool(cue.get("metric", np.array(True))):
-                depth = cues_io.expect_shape(cue["depth"], (len(video), None, None), "depth of cues/depth.npz")
+            depth = cues_io.metric_depth_from_cue(folder.read("depth", "depth"), len(video))
+            if depth is not None:
                 return depth_scale(fit, tracks, depth, video.size)
         return fit
 

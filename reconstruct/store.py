@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -17,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from taa_envs.arrays import read_npz
 from taa_envs.files import written_whole
 
 SCHEMA = 1
+MAX_STAGE_BYTES = 8 << 30
 ROOT = Path(__file__).resolve().parent
 
 
@@ -104,12 +105,11 @@ def save_stage(path: Path, key: str, value: Any) -> None:
 def load_stage(path: Path, key: str | None) -> Any | None:
     """The stored result if it is there, readable and made under the same key (None: any key), else None."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            head = json.loads(data["head"].tobytes())
-            if head["schema"] != SCHEMA or key not in (None, head["key"]):
-                return None
-            return unpack(head["tree"], {name: data[name] for name in data.files if name != "head"})
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        head = json.loads(read_npz(path, ("head",), MAX_STAGE_BYTES)["head"].tobytes())
+        if head["schema"] != SCHEMA or key not in (None, head["key"]):
+            return None
+        return unpack(head["tree"], read_npz(path, max_bytes=MAX_STAGE_BYTES))
+    except Exception:  # whatever is wrong with a kept result, it is made again
         return None
 
 

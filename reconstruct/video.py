@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruct.container import FORMATS, MAX_DECODED, MIN_SIDE, open_video
 from reconstruct.errors import Refused, TaaError
 
 WORK_LONG_SIDE = 960
@@ -22,6 +23,8 @@ MAX_WORK_RATE = 31.0
 """Frames a second; a little over 30 so that the jitter of a 30 Hz clip drops nothing."""
 SETTLE_SECONDS = 0.5
 """Cameras hunt for exposure and decoders lack references only at the very start."""
+LONGEST_GAP = 60.0
+"""s; a longer one between two frames, far beyond the clip's usual spacing, is a broken time stamp."""
 FLAT_GREY = 2.0
 JUMP_GREY = 8.0
 THUMB = 64
@@ -120,7 +123,7 @@ def load_video(
     kept: list[int] = []
     thumbs: list[np.ndarray] = []
     other_size = flat = 0
-    cap = _open(path)
+    cap = open_video(path)
     try:
         following = iter(wanted)
         target = next(following)
@@ -139,6 +142,9 @@ def load_video(
                     flat += 1
                     continue
                 size = (image.shape[1], image.shape[0])
+                if min(size) < MIN_SIDE or max(size) > 8 * min(size):
+                    raise TaaError(f"{path} has frames of {size[0]} x {size[1]} px; at least {MIN_SIDE} px a side and "
+                                   "no strip longer than 8 to 1 can be worked on")  # fmt: skip
                 scale = min(1.0, long_side / max(size))
                 store = _frame_store((len(wanted), round(size[1] * scale), round(size[0] * scale), 3), scratch)
             if (image.shape[1], image.shape[0]) != size:
@@ -246,26 +252,18 @@ def _trackable(a: np.ndarray, b: np.ndarray) -> float:
     return float(good.mean())
 
 
-def _open(path: Path):
-    import cv2
-
-    cap = cv2.VideoCapture(str(path))
-    if not cap.isOpened():
-        raise TaaError(f"not a video that OpenCV can decode: {path}; convert it to H.264 MP4")
-    cap.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-    return cap
-
-
 def _container_times(path: Path, notes: list[str]) -> np.ndarray:
     """(N,) increasing times of the frames that decode; `grab` skips colour conversion, so this pass is cheap."""
     import cv2
 
-    cap = _open(path)
+    cap = open_video(path)
     try:
         rate, claimed = cap.get(cv2.CAP_PROP_FPS), cap.get(cv2.CAP_PROP_FRAME_COUNT)
         times = []
         while cap.grab():
             times.append(cap.get(cv2.CAP_PROP_POS_MSEC) / 1000.0)
+            if len(times) > MAX_DECODED:
+                raise TaaError(f"{path} has more than {MAX_DECODED} frames; cut it to the part that matters")
     finally:
         cap.release()
     if len(times) < 2:
@@ -273,9 +271,12 @@ def _container_times(path: Path, notes: list[str]) -> np.ndarray:
     if claimed > len(times) + 1:
         notes.append(f"the container claims {claimed:.0f} frames, {len(times)} decode")
     time = np.asarray(times)
-    if not np.all(np.diff(time) > 0):
+    step = np.diff(time)
+    increasing = bool(np.isfinite(time).all() and (step > 0).all())
+    if not increasing or step.max() > max(LONGEST_GAP, 100 * float(np.median(step))):
         rate = rate if 1.0 <= rate <= 1000.0 else 30.0
-        notes.append(f"container times do not increase; {rate:.4g} frames a second assumed")
+        what = "jump" if increasing else "do not increase"
+        notes.append(f"container times {what}; {rate:.4g} frames a second assumed")
         time = np.arange(len(time)) / rate
     return time
 
@@ -317,7 +318,8 @@ def _focal(path: Path, size: tuple[int, int]) -> tuple[float | None, str | None]
     import imageio_ffmpeg
 
     try:
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-f", "ffmetadata", "-"]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-protocol_whitelist", "file,pipe",
+                   "-format_whitelist", ",".join(FORMATS), "-i", f"file:{path}", "-f", "ffmetadata", "-"]  # fmt: skip
         text = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=30).stdout
     except (OSError, RuntimeError, subprocess.TimeoutExpired):
         return None, None

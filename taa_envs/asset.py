@@ -6,34 +6,35 @@ checks shapes and names before anything else in the package sees them.
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import re
 import stat
-import zipfile
 from dataclasses import dataclass, field, fields
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
+from taa_envs.arrays import ArrayFileError, read_npz
+from taa_envs.checks import (
+    ID_PATTERN,
+    JOINT_TYPES,
+    MAX_LENGTH,
+    ORIGINS,
+    SCHEMA,
+    check_compiled,
+    check_id,
+    check_xml,
+    read_metadata,
+)
 from taa_envs.errors import AssetError, AssetExists, TaaEnvsError
 
-__all__ = ["ID_PATTERN", "ORIGINS", "SCHEMA", "Asset", "AssetError", "AssetExists", "Reference", "TaaEnvsError",
-           "check_id", "demonstration", "load_asset", "read_metadata", "save_asset"]
+__all__ = ["ID_PATTERN", "JOINT_TYPES", "ORIGINS", "SCHEMA", "Asset", "AssetError", "AssetExists", "Reference",
+           "TaaEnvsError", "check_id", "demonstration", "load_asset", "read_metadata", "save_asset"]
 
-SCHEMA = "taa-asset/1"
-ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-ORIGINS = ("observed", "fitted", "assumed", "given")
-JOINT_TYPES = ("revolute", "prismatic")
-
-MAX_JSON_BYTES = 8 << 20
-MAX_XML_BYTES = 16 << 20
 MAX_FILE_BYTES = 256 << 20
 MAX_ARRAY_BYTES = 256 << 20
 MAX_FILES = 4096
+MAX_DEPTH = 8  # folders below folders
 MAX_FRAMES = 200_000
 
 
@@ -82,6 +83,8 @@ class Reference:
                 raise AssetError(f"reference array {name!r} has shape {value.shape}, expected {shape}")
             if not np.isfinite(value).all():
                 raise AssetError(f"reference array {name!r} is not finite; fill gaps and mark them in hand_valid")
+            if np.abs(value).max() > MAX_LENGTH:
+                raise AssetError(f"reference array {name!r} holds numbers beyond {MAX_LENGTH:g}; give s, rad and m")
         if not (np.diff(values["time"]) > 0).all():
             raise AssetError("reference time does not increase; sort the frames and drop doubles")
         return cls(**values)
@@ -167,18 +170,6 @@ class Asset:
         return abs(float(q) - self.demo["q_demo_end"]) / (self.demo["q_max"] - self.demo["q_min"])
 
 
-def check_id(asset_id: object) -> str:
-    """The id itself if it is one.
-
-    Raises:
-        AssetError: it does not match ``[a-z0-9][a-z0-9_-]{0,63}``.
-    """
-    if not isinstance(asset_id, str) or not ID_PATTERN.fullmatch(asset_id):
-        raise AssetError(f"id {str(asset_id)[:80]!r} is not valid; use 1 to 64 of a-z 0-9 _ -, beginning with a letter "
-                         "or a digit")
-    return asset_id
-
-
 def _regular_files(folder: Path) -> dict[str, Path]:
     """Relative posix name -> path of every file below folder; refuses links and special files."""
     if folder.is_symlink():
@@ -187,6 +178,8 @@ def _regular_files(folder: Path) -> dict[str, Path]:
         raise AssetError(f"{folder} is not a folder")
     found: dict[str, Path] = {}
     for root, dirs, files in os.walk(folder, followlinks=False):
+        if len(Path(root).relative_to(folder).parts) > MAX_DEPTH:
+            raise AssetError(f"{folder} holds folders more than {MAX_DEPTH} deep")
         for name in (*dirs, *files):
             path = Path(root) / name
             mode = path.lstat().st_mode
@@ -203,145 +196,14 @@ def _regular_files(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _finite_numbers(value: object) -> bool:
-    if isinstance(value, bool) or value is None:
-        return True
-    if isinstance(value, (int, float)):
-        return math.isfinite(value)
-    if isinstance(value, dict):
-        return all(_finite_numbers(v) for v in value.values())
-    if isinstance(value, list):
-        return all(_finite_numbers(v) for v in value)
-    return True
-
-
-def _vector(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise AssetError(f"{what} does not hold numbers") from None
-    if array.shape != shape or not np.isfinite(array).all():
-        raise AssetError(f"{what} must be {shape} finite numbers, has shape {array.shape}")
-    return array
-
-
-def read_metadata(folder: Path) -> dict:
-    """``asset.json`` of a folder, checked, without touching model or arrays.
-
-    Raises:
-        AssetError: what is wrong with it.
-    """
-    path = Path(folder) / "asset.json"
-    if Path(folder).is_symlink() or path.is_symlink() or not path.is_file():
-        raise AssetError(f"{folder} has no plain file asset.json")
-    if path.stat().st_size > MAX_JSON_BYTES:
-        raise AssetError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB")
-    try:
-        data = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise AssetError(f"{path} is not JSON ({str(error)[:80]})") from None
-    if not isinstance(data, dict):
-        raise AssetError(f"{path} does not hold an object")
-    if data.get("schema") != SCHEMA:
-        raise AssetError(f"{path} has schema {str(data.get('schema'))[:40]!r}; this version reads {SCHEMA!r}")
-    check_id(data.get("id"))
-    if data["id"] != Path(folder).resolve().name:
-        raise AssetError(f"{path} has id {data['id']!r}, which is not its folder's name")
-    if not _finite_numbers(data):
-        raise AssetError(f"{path} holds a number that is not finite; write null where a number is unknown")
-    for key in ("joint", "provenance", "demo"):
-        if not isinstance(data.get(key), dict):
-            raise AssetError(f"{path} has no object {key!r}")
-    _check_joint(data["joint"])
-    _check_provenance(data["provenance"])
-    _check_demo(data["demo"])
-    if data.get("camera") is not None:
-        _check_camera(data["camera"])
-    return data
-
-
-def _check_joint(joint: dict) -> None:
-    if joint.get("type") not in JOINT_TYPES:
-        raise AssetError(f"joint type {str(joint.get('type'))[:40]!r} is not simulated; known: "
-                         + ", ".join(JOINT_TYPES))
-    axis = _vector(joint.get("axis"), (3,), "joint axis")
-    if abs(np.linalg.norm(axis) - 1) > 1e-3:
-        raise AssetError(f"joint axis has length {np.linalg.norm(axis):.4g}; normalise it")
-    if joint["type"] == "revolute":
-        _vector(joint.get("point"), (3,), "joint point")
-
-
-def _check_provenance(provenance: dict) -> None:
-    for name, entry in provenance.items():
-        if not isinstance(entry, dict) or "value" not in entry or entry.get("origin") not in ORIGINS:
-            raise AssetError(f"provenance of {str(name)[:60]!r} needs value and origin, one of {', '.join(ORIGINS)}")
-        std = entry.get("std")
-        if std is not None and not isinstance(std, list) and not (isinstance(std, (int, float)) and std >= 0):
-            raise AssetError(f"provenance of {str(name)[:60]!r} has a std that is not a number >= 0")
-
-
-def _check_demo(demo: dict) -> None:
-    for key in ("q_start", "q_demo_end", "q_min", "q_max", "duration"):
-        if not isinstance(demo.get(key), (int, float)) or isinstance(demo[key], bool):
-            raise AssetError(f"demo has no number {key!r}")
-    if not isinstance(demo.get("demo_end_frame"), int) or demo["demo_end_frame"] < 1:
-        raise AssetError("demo_end_frame must be a frame after the first")
-    if not abs(demo["q_demo_end"] - demo["q_start"]) > 1e-6 or not demo["q_max"] > demo["q_min"]:
-        raise AssetError("the demonstration does not move the joint")
-    if not 0 < demo["duration"] <= 3600:
-        raise AssetError("demo duration must lie between 0 and 3600 s")
-
-
-def _check_camera(camera: object) -> None:
-    if not isinstance(camera, dict):
-        raise AssetError("camera must be an object with K, T_camera_world, width, height")
-    _vector(camera.get("K"), (3, 3), "camera K")
-    _vector(camera.get("T_camera_world"), (4, 4), "camera T_camera_world")
-    for key in ("width", "height"):
-        if not isinstance(camera.get(key), int) or not 1 <= camera[key] <= 32768:
-            raise AssetError(f"camera {key} must be a whole number of pixels")
-
-
 def _read_reference(path: Path) -> Reference:
+    names = [f.name for f in fields(Reference)]
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > MAX_ARRAY_BYTES:
-                raise AssetError(f"{path} unpacks to more than {MAX_ARRAY_BYTES >> 20} MiB")
-        with np.load(path, allow_pickle=False) as arrays:
-            names = {f.name for f in fields(Reference)}
-            return Reference.from_arrays({name: arrays[name] for name in names & set(arrays.files)})
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
-        raise AssetError(f"{path} is not an archive of plain arrays ({str(error)[:80]})") from None
-
-
-def _inside(name: str) -> bool:
-    pure = PurePosixPath(name)
-    return not (pure.is_absolute() or ".." in pure.parts or "\\" in name or ":" in name or "\0" in name)
-
-
-def _check_xml(path: Path, files: dict[str, Path]) -> None:
-    """Only references to plain files inside the folder, nothing that loads code or other XML."""
-    if path.stat().st_size > MAX_XML_BYTES:
-        raise AssetError(f"{path} is larger than {MAX_XML_BYTES >> 20} MiB")
-    raw = path.read_bytes()
-    if b"<!" in re.sub(rb"<!--.*?-->", b"", raw, flags=re.DOTALL):
-        raise AssetError(f"{path} has a document type or an entity; plain MJCF needs neither")
-    try:
-        root = ElementTree.fromstring(raw)
-    except ElementTree.ParseError as error:
-        raise AssetError(f"{path} is not XML ({error})") from None
-    for element in root.iter():
-        if element.tag in ("include", "plugin", "extension", "attach", "model"):
-            raise AssetError(f"{path} uses <{element.tag}>; an asset's model is one self-contained file")
-        for key in ("meshdir", "texturedir", "assetdir"):
-            if not _inside(element.get(key, "")):
-                raise AssetError(f"{path}: {key} leaves the folder")
-        for key, value in element.attrib.items():
-            if key.startswith("file") and value:
-                if not _inside(value):
-                    raise AssetError(f"{path} names {value[:80]!r}, which leaves the folder")
-                if not any(name == value or name.endswith("/" + value) for name in files):
-                    raise AssetError(f"{path} names {value[:80]!r}, which is not in the folder")
+        return Reference.from_arrays(read_npz(path, names, MAX_ARRAY_BYTES))
+    except ArrayFileError as error:
+        raise AssetError(str(error)) from None
+    except OSError as error:
+        raise AssetError(f"{path} cannot be read ({error.strerror})") from None
 
 
 def _check_model(path: Path, joint: dict) -> None:
@@ -349,18 +211,10 @@ def _check_model(path: Path, joint: dict) -> None:
 
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise AssetError(f"{path} does not load in MuJoCo {mujoco.__version__}: {str(error)[:200]}") from None
-    bodies = {model.body(i).name for i in range(model.nbody)}
-    if not {"static", "moving"} <= bodies:
-        raise AssetError(f"{path} has bodies {sorted(bodies - {'world'})}; it needs static and moving")
-    if model.nu or model.neq or model.nv != 1 or model.njnt != 1 or model.joint(0).name != "joint":
-        raise AssetError(f"{path} must have one joint named 'joint', no actuator and no equality")
-    kind = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
-    if kind.get(int(model.jnt_type[0])) != joint["type"]:
-        raise AssetError(f"{path}: the joint's type is not asset.json's {joint['type']!r}")
-    if int(model.jnt_bodyid[0]) != model.body("moving").id:
-        raise AssetError(f"{path}: the joint does not belong to the body 'moving'")
+    except (ValueError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError) as error:
+        raise AssetError(f"{path} does not load in MuJoCo {mujoco.__version__}: {' '.join(str(error).split())[:200]}"
+                         ) from None
+    check_compiled(model, path, joint)
 
 
 def load_asset(path: str | os.PathLike, *, check_model: bool = True) -> Asset:
@@ -382,7 +236,7 @@ def load_asset(path: str | os.PathLike, *, check_model: bool = True) -> Asset:
     reference = _read_reference(files["reference.npz"])
     if data["demo"]["demo_end_frame"] >= len(reference.time):
         raise AssetError(f"{folder}: demo_end_frame lies after the reference's last frame")
-    _check_xml(files["model.xml"], files)
+    check_xml(files["model.xml"], files)
     if check_model:
         _check_model(files["model.xml"], data["joint"])
     return Asset(id=data["id"], path=folder, schema=data["schema"], joint=data["joint"],

@@ -15,8 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from taa_envs.arrays import read_npy
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import folder_written_whole, written_whole
+
+MAX_LOG_BYTES = 256 << 20
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ def score(asset_id: str, file: Path, hand: str) -> Outcome:
     asset = registry.get_asset(asset_id)
     try:
         if file.suffix == ".npy":
-            data = scoring.score_actions(asset, np.load(file, allow_pickle=False), hand)
+            data = scoring.score_actions(asset, read_npy(file), hand)
         else:
             data = scoring.score_joint_log(asset, *read_joint_log(file))
     except ValueError as error:
@@ -210,6 +213,15 @@ def read_joint_log(file: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         TaaEnvsError: a column is missing or a row does not hold numbers.
     """
+    if file.is_file() and file.stat().st_size > MAX_LOG_BYTES:
+        raise TaaEnvsError(f"{file} is larger than {MAX_LOG_BYTES >> 20} MiB; give one episode, thinned if need be")
+    try:
+        return _columns(file)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise TaaEnvsError(f"{file} is no CSV ({str(error)[:80]}); a joint log is a CSV with time and q") from None
+
+
+def _columns(file: Path) -> tuple[np.ndarray, np.ndarray]:
     with file.open(newline="", encoding="utf-8") as f:
         rows = csv.DictReader(f)
         missing = {"time", "q"} - set(rows.fieldnames or ())
@@ -379,7 +391,7 @@ def replay_rows(result: dict) -> list[tuple[str, str]]:
 
 
 def _joint_rows(joint: dict) -> list[tuple[str, str]]:
-    rows = [("verdict", joint["verdict"]), ("reason", joint.get("reason") or "")]
+    rows = [("verdict", joint.get("verdict") or "not stated"), ("reason", joint.get("reason") or "")]
     if joint.get("type") is None:
         return rows
     std = joint.get("std") or {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +100,9 @@ def _mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, folder: Path) -> Any:
     import trimesh
     from PIL import Image
 
-    mesh: Any = trimesh.load(folder / spec.meshdir / spec.mesh(geom.meshname).file, force="mesh", process=False)
+    file = folder / spec.meshdir / spec.mesh(geom.meshname).file
+    # From bytes: materials that a mesh names in other files are not looked for.
+    mesh: Any = trimesh.load(io.BytesIO(file.read_bytes()), file_type=file.suffix[1:], force="mesh", process=False)
     material = spec.material(geom.material) if geom.material else None
     textures = [spec.texture(name).file for name in material.textures if name] if material is not None else []
     uv = getattr(mesh.visual, "uv", None)

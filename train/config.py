@@ -11,6 +11,7 @@ from typing import Any
 from taa_envs.errors import TaaEnvsError
 
 ALGORITHMS = ("ppo", "sac")
+MAX_BYTES = 64 << 10
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,20 @@ def load_config(algo: str = "ppo", file: Path | None = None, **changes: Any) -> 
         raise TaaEnvsError(f"no algorithm is named {algo!r}; known: {', '.join(ALGORITHMS)}")
     file = Path(file) if file is not None else Path(__file__).with_name("configs") / f"{algo}.toml"
     try:
+        if file.stat().st_size > MAX_BYTES:
+            raise TaaEnvsError(f"{file} is larger than {MAX_BYTES >> 10} KiB; training settings take a few lines")
         made = Config(algo=algo, **{**tomllib.loads(file.read_text(encoding="utf-8")),
                                     **{k: v for k, v in changes.items() if v is not None}})
-    except (tomllib.TOMLDecodeError, TypeError, UnicodeDecodeError) as error:
-        raise TaaEnvsError(f"{file} does not hold training settings ({error}); copy one of train/configs") from None
-    for name in ("envs", "steps", "checkpoint_every"):
-        if not isinstance(getattr(made, name), int) or getattr(made, name) < 1:
-            raise TaaEnvsError(f"{name} must be a whole number of at least 1, is {getattr(made, name)!r}")
+    except (ValueError, TypeError, RecursionError) as error:  # tomllib goes down by recursion, and knows bad dates
+        reason = " ".join(str(error).split())[:120]
+        raise TaaEnvsError(f"{file} does not hold training settings ({reason}); copy one of train/configs") from None
+    for name, most in (("envs", 65_536), ("steps", 10**12), ("checkpoint_every", 10**12)):
+        value = getattr(made, name)
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
+            raise TaaEnvsError(f"{name} must be a whole number from 1 to {most}, is {str(value)[:40]}; mend {file}")
+    for name, kinds in (("reward", (str, dict)), ("action", (str,)), ("randomize", (bool, list, dict)),
+                        ("seed", (int,)), ("algorithm", (dict,)), ("policy", (dict,))):  # fmt: skip
+        if not isinstance(getattr(made, name), kinds):
+            words = " or ".join(k.__name__ for k in kinds)
+            raise TaaEnvsError(f"{name} must be {words}, is {str(getattr(made, name))[:40]!r}; mend {file}")
     return made

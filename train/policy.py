@@ -97,7 +97,7 @@ def load_policy(file: str | os.PathLike) -> tuple[BasePolicy, dict[str, Any]]:
             spaces.Box(-1.0, 1.0, (content["action_size"],), np.float32), lambda _: 0.0,
             use_sde=content["use_sde"], **content["policy"])
         made.load_state_dict(content["weights"])
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, RuntimeError, ValueError, AttributeError, MemoryError) as error:
         raise TaaEnvsError(f"{file} does not hold a whole policy ({str(error)[:100]}); train it again") from None
     made.set_training_mode(False)
     return made, {name: content[name] for name in ("algo", "asset", "action")}
