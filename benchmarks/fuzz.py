@@ -459,6 +459,17 @@ def keep(out: Path, target: str, raw: bytes, error: Exception) -> None:
         file.with_name(file.name + ".txt").write_text("".join(traceback.format_exception(error)), encoding="utf-8")
 
 
+def run_child(command: list[str], seconds: float) -> tuple[int | None, str]:
+    """Exit code (None: it was ended after that time) and stderr."""
+    with tempfile.TemporaryFile("w+", errors="replace") as words:
+        try:
+            code = subprocess.run(command, cwd=ROOT, stdout=words, stderr=words, timeout=seconds).returncode
+        except subprocess.TimeoutExpired:
+            code = None
+        words.seek(0)
+        return code, words.read()
+
+
 def fuzz(target: str, runs: int, seconds: int, out: Path, seed: int) -> dict:
     """Run one target until that many inputs or seconds; a process that dies is started again."""
     begin, done, deaths = time.monotonic(), 0, 0
@@ -484,16 +495,16 @@ def fuzz(target: str, runs: int, seconds: int, out: Path, seed: int) -> dict:
         ]
         ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, errors="replace")
         count = (
-            re.findall(r"number_of_executed_units:\s*(\d+)", ended.stderr)
-            or re.findall(r"Done (\d+) runs", ended.stderr)
-            or re.findall(r"^#(\d+)", ended.stderr, re.M)
+            re.findall(r"number_of_executed_units:\s*(\d+)", words)
+            or re.findall(r"Done (\d+) runs", words)
+            or re.findall(r"^#(\d+)", words, re.M)
         )
-        slow = re.findall(r"slowest_unit_time_sec:\s*(\d+)", ended.stderr)
+        slow = re.findall(r"slowest_unit_time_sec:\s*(\d+)", words)
         longest = max([longest, *map(int, slow)])
         done += int(count[-1]) if count else 0
-        if ended.returncode != 0:
+        if code != 0:
             deaths += 1
-            (out / f"{target}-death{deaths}.txt").write_text(ended.stderr[-6000:], encoding="utf-8")
+            (out / f"{target}-death{deaths}.txt").write_text(words[-6000:], encoding="utf-8")
             if not count:
                 break
         elif not count:
@@ -531,10 +542,8 @@ def main() -> None:
     for target in args.targets:
         row = fuzz(target, args.runs or RUNS[target], args.seconds, args.out.resolve(), args.seed)
         rows.append(row)
-        print(
-            "| " + " | ".join(str(row[k]) for k in ("target", "inputs", "crashes", "hangs", "slowest_s", "seconds")) + " |",
-            flush=True,
-        )
+        columns = ("target", "inputs", "crashes", "hangs", "slowest_s", "seconds")
+        print("| " + " | ".join(str(row[k]) for k in columns) + " |", flush=True)
     total = {k: sum(r[k] for r in rows) for k in ("inputs", "crashes", "hangs")}
     print(f"| together | {total['inputs']} | {total['crashes']} | {total['hangs']} | | |")
     for row in rows:
