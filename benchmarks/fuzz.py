@@ -493,7 +493,9 @@ def fuzz(target: str, runs: int, seconds: int, out: Path, seed: int) -> dict:
             "--seed",
             str(seed + deaths),
         ]
-        ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, errors="replace")
+        code, words = run_child(command, left + 60)
+        if code is None:  # native code that libFuzzer's own alarm does not reach
+            (out / f"{target}-timeout-outer{deaths}").write_text(words, encoding="utf-8")
         count = (
             re.findall(r"number_of_executed_units:\s*(\d+)", words)
             or re.findall(r"Done (\d+) runs", words)
