@@ -25,6 +25,7 @@ from taa_envs.asset import (
     load_asset,
 )
 from taa_envs.files import folder_written_whole
+from taa_envs.gate import examine
 from taa_envs.surface import Link, link_inertia, write_convex_part, write_textured_obj
 
 # A video carries no forces: these are assumptions, and asset.json says so.
@@ -187,8 +188,11 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
                mass: float | None = None, density: float = DENSITY, damping: float | None = None,
                frictionloss: float | None = None, camera: Mapping | None = None, provenance: Mapping | None = None,
                source: Mapping | None = None, providers: Sequence[Mapping] = (), notes: Sequence[str] = (),
-               files: Mapping[str, bytes | str | os.PathLike] | None = None, overwrite: bool = False) -> Asset:
+               files: Mapping[str, bytes | str | os.PathLike] | None = None, overwrite: bool = False,
+               gate: bool = True) -> Asset:
     """Write ``root/<asset_id>/``: model, meshes, reference and ``asset.json``; atomic.
+
+    Before the folder takes its name it passes :mod:`taa_envs.gate`; what the gate found is in ``asset.json``.
 
     All is written into a hidden sibling folder that is loaded back and then renamed, so a crash or a full disk leaves
     nothing under the final name.
@@ -210,10 +214,12 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
         providers: {"name", "version", "licence"} of each that took part.
         files: further files: name -> bytes, or the path of a file to copy (preview.png, report.html).
         overwrite: replace an asset of that id.
+        gate: False leaves the gate out, for a body that is to be looked at although it may not behave; ``asset.json``
+            then says null under "gate".
 
     Raises:
         AssetExists: there is one and overwrite is False.
-        AssetError: an argument is not valid; nothing was written.
+        AssetError: an argument is not valid, or the body does not pass the gate; nothing was written.
     """
     import mujoco
 
@@ -279,8 +285,6 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
                 "source": source, "providers": list(providers), "mujoco_version": mujoco.__version__,
                 "taa_envs_version": _own_version(), "notes": [*notes, *model_notes],
             }
-            text = json.dumps(_plain(document), indent=1, allow_nan=False)
-            (folder / "asset.json").write_text(text, encoding="utf-8")
             for name, content in (files or {}).items():
                 if Path(name).name != name or name in ("asset.json", "model.xml", "reference.npz", "meshes"):
                     raise AssetError(f"cannot put a further file under the name {name!r}")
@@ -288,10 +292,21 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
                     (folder / name).write_bytes(content)
                 else:
                     shutil.copyfile(content, folder / name)
-            load_asset(folder)
+            document["gate"] = None
+            _write_json(folder / "asset.json", document)
+            made_asset = load_asset(folder)
+            if gate:
+                found = examine(made_asset)
+                if not found.passed:
+                    raise AssetError(f"{asset_id} does not pass the gate: {found.failures[0]}")
+                _write_json(folder / "asset.json", {**document, "gate": found.as_dict()})
     except FileExistsError:  # made by somebody else while we worked
         raise AssetExists(f"{final} exists; choose another id or overwrite it") from None
     return load_asset(final, check_model=False)
+
+
+def _write_json(path: Path, document: Mapping) -> None:
+    path.write_text(json.dumps(_plain(document), indent=1, allow_nan=False), encoding="utf-8")
 
 
 def _own_version() -> str:

@@ -197,8 +197,8 @@ class Export(Common):
 
     id: tyro.conf.Positional[str]
     """Id of an asset."""
-    format: Literal["mjcf"] = "mjcf"
-    """mjcf: a folder with model.xml and its meshes."""
+    format: Literal["mjcf", "urdf", "usd"] = "mjcf"
+    """mjcf: model.xml; urdf: <id>.urdf; usd: <id>.usda with UsdPhysics (needs the extra usd); each with its meshes."""
     out: Path | None = None
     """Folder to write (default: ./<id>_<format>)."""
     overwrite: bool = False

@@ -6,7 +6,6 @@ Imports happen inside the functions, so that ``taa list`` does not wait for Open
 from __future__ import annotations
 
 import csv
-import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -240,15 +239,21 @@ def _columns(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def export(asset_id: str, kind: str, out: Path | None, overwrite: bool) -> Outcome:
     from taa_envs import registry
+    from taa_envs.exports import export_asset
+    from taa_envs.exports.check import check_export
 
     asset = registry.get_asset(asset_id)
     target = out if out is not None else Path(f"{asset_id}_{kind}")
     if target.exists() and not overwrite:
         raise TaaEnvsError(f"{target} exists; choose another --out or use --overwrite")
     with folder_written_whole(target, overwrite) as work:
-        shutil.copyfile(asset.model_path, work / "model.xml")
-        shutil.copytree(asset.path / "meshes", work / "meshes")
-    return Outcome({"id": asset_id, "format": kind, "path": str(target)}, lambda: print(target / "model.xml"))
+        work.rmdir()
+        file = export_asset(asset, kind, work)
+        if wrong := check_export(asset, kind, file):
+            raise TaaEnvsError(f"the {kind} export of {asset_id} comes back changed: {wrong[0]}; report this as a bug")
+    main = target / file.name
+    data = {"id": asset_id, "format": kind, "path": str(target), "file": str(main)}
+    return Outcome(data, lambda: print(main))
 
 
 def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: bool) -> Outcome:

@@ -265,5 +265,5 @@ def chest(seed: int) -> Model:
         boxes.append(make_box("static", (x, 0.06, wall), (x + 0.055, 0.14, 0.07), packet))
     boxes.append(make_box("moving", (-w, -0.030, h + 0.002), (w, d, h + 0.018), top, density=1500))
     # Lifting the front edge turns the lid about -x.
-    axis, point = np.array([-1.0, 0, 0]), np.array([0.0, d - 0.004, h + 0.004])
+    axis, point = np.array([-1.0, 0, 0]), np.array([0.0, d - 0.004, h + 0.008])
     return Model(tuple(boxes), "revolute", axis, point, np.radians(50.0), (0.0, np.radians(100.0)))
