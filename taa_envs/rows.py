@@ -69,6 +69,7 @@ class SingleRows:
         self._mujoco, self.model = mujoco, scene.model
         self.data = mujoco.MjData(scene.model) if data is None else data
         self.qpos, self.qvel = self.data.qpos[None], self.data.qvel[None]
+        self.act, self.history = self.data.act[None], self.data.history[None]
         self.ctrl, self.sensordata = self.data.ctrl[None], self.data.sensordata[None]
         self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -113,6 +114,7 @@ class BatchRows:
         self.n, self._none = n, int(mujoco.mjtStage.mjSTAGE_NONE)
         self.batch = Batch(scene.model, n, threads)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.act, self.history = self.batch.bind("act"), self.batch.bind("history")
         self.ctrl, self.sensordata = self.batch.bind("ctrl"), self.batch.bind("sensordata")
         self._time = self.batch.bind("time")
         self._model: dict[str, np.ndarray] = {}
@@ -161,7 +163,7 @@ class PointsRows:
             return out
 
         self._here, self._speed = view(rows.qpos, controller.qpos), view(rows.qvel, controller.dof)
-        self._ctrl = view(rows.ctrl, controller.act)
+        self._velocity, self._target = view(rows.ctrl, controller.act), view(rows.act, controller.target)
 
     def targets(self, joints: np.ndarray) -> np.ndarray:
         """(..., S, 3) sphere targets of landmarks (..., 21, 3), m."""
@@ -169,8 +171,8 @@ class PointsRows:
 
     def place(self, ids: np.ndarray, joints: np.ndarray) -> None:
         """Put the hands at landmarks (n, 21, 3) m, at rest."""
-        self._here[ids] = self._ctrl[ids] = self.weights @ joints
-        self._speed[ids] = 0.0
+        self._here[ids] = self._target[ids] = self.weights @ joints
+        self._speed[ids] = self._velocity[ids] = 0.0
 
     def control(self, target: np.ndarray) -> None:
         """Aim at targets (n, S, 3) m within the limits of each sphere and of the whole hand."""
@@ -186,7 +188,8 @@ class PointsRows:
         if total.max() > hand.total_force:
             share = (hand.total_force / np.maximum(total, hand.total_force))[:, None, None]
             target = np.where(share < 1.0, here + (pull * share + drag) / hand.stiffness, target)
-        self._ctrl[:] = target
+        self._target[:] = target
+        self._velocity[:] = 0.0
 
     def landmarks(self) -> np.ndarray:
         """(n, 21, 3) m; a copy."""

@@ -16,11 +16,13 @@ import numpy as np
 from taa_envs.asset import Asset
 from taa_envs.errors import AssetError
 from taa_envs.hands import Controller, Hand, make_hand
+from taa_envs.registry import CONTROL_PERIOD
 
 if TYPE_CHECKING:
     import mujoco
 
 TIMESTEP = 0.002  # s
+SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)  # in one environment step
 MOVING_BIT, STATIC_BIT = 1 << 1, 1 << 2
 FLOOR_GAP = 0.01  # m between the lowest point of either link and the floor
 
@@ -119,7 +121,9 @@ def _add_cameras(spec: mujoco.MjSpec, asset: Asset, swept: np.ndarray) -> None:
 def _add_touch(spec: mujoco.MjSpec) -> None:
     """Sensors of what touches the moving link: ``touch`` the net wrench, ``touch_depth`` the deepest contact.
 
-    Only a hand can touch it, see the module's text. A sensor costs a fraction of reading contacts in Python.
+    Only a hand can touch it, see the module's text. A sensor costs a fraction of reading contacts in Python. MuJoCo keeps
+    what ``touch`` said in each of the last :data:`SUBSTEPS` steps (:func:`touch_history`), so that many steps can be made
+    in one call without losing what touched in between.
     """
     import mujoco
 
@@ -129,11 +133,21 @@ def _add_touch(spec: mujoco.MjSpec) -> None:
         sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_BODY,
                                  objname="moving")
         sensor.intprm[:3] = [sum(1 << int(d) for d in data), reduce, 1]
+        if name == "touch":
+            sensor.nsample = SUBSTEPS
 
 
 def touch_columns(scene: Scene) -> tuple[int, int]:
     """Where the two sensors' numbers begin in ``sensordata``."""
     return int(scene.model.sensor("touch").adr[0]), int(scene.model.sensor("touch_depth").adr[0])
+
+
+def touch_history(scene: Scene) -> slice:
+    """Where in ``MjData.history`` the last :data:`SUBSTEPS` readings of ``touch`` are, in no order: 10 numbers each."""
+    sensor, model = scene.model.sensor("touch").id, scene.model
+    count, size = int(model.sensor_history[sensor, 0]), int(model.sensor_dim[sensor])
+    first = int(model.sensor_historyadr[sensor]) + 2 + count  # after the buffer's own two numbers and its times
+    return slice(first, first + count * size)
 
 
 def decode_touch(columns: tuple[int, int], sensordata: np.ndarray

@@ -16,9 +16,8 @@ from taa_envs import randomize
 from taa_envs.registry import CONTROL_PERIOD
 from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, RewardInputs, goal_reward, reward_scales, reward_terms
 from taa_envs.rows import MODEL_FIELDS, Rows, hand_rows
-from taa_envs.scene import TIMESTEP, Scene, decode_touch, touch_columns
+from taa_envs.scene import SUBSTEPS, TIMESTEP, Scene, decode_touch, touch_columns
 
-SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 TRANSLATION, ROTATION, CLOSURE = 0.03, 0.3, 0.5  # m, rad, share of the way: residuals of an action of 1
 RESIDUALS, ABSOLUTES = 7, 63
 HAND_SPEED = 2.0  # m/s, of an absolute target, or 1.5 times the demonstration's fastest where that is faster

@@ -90,7 +90,9 @@ class PointsHand:
                 joint = body.add_joint(name=f"hand{i}_{'xyz'[k]}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
                 actuator = spec.add_actuator(name=joint.name, target=joint.name,
                                              trntype=mujoco.mjtTrn.mjTRN_JOINT)
-                actuator.set_to_position(kp=self.stiffness, kv=self.damping)
+                # A position servo whose target is a state that ``ctrl`` moves at so many m/s: MuJoCo then carries the
+                # target along inside its own steps, with no Python between them.
+                actuator.set_to_intvelocity(kp=self.stiffness, kv=self.damping)
                 actuator.forcerange = [-self.sphere_force, self.sphere_force]
                 actuator.forcelimited = 1
 
@@ -105,6 +107,8 @@ class PointsController:
         lead: s by which targets must run ahead of the demonstration: a critically damped servo follows a ramp
             ``damping / stiffness`` late.
         geoms: (S,) ids of the spheres.  tip_geoms: (5,).
+        qpos, dof, act, target: (S, 3) addresses in ``qpos``, ``qvel``, ``ctrl`` (velocities of the targets) and ``act``
+            (the targets).
     """
 
     def __init__(self, hand: PointsHand, model: mujoco.MjModel) -> None:
@@ -116,13 +120,15 @@ class PointsController:
         self.qpos = np.array([[model.joint(f"{n}_{a}").qposadr[0] for a in "xyz"] for n in names])
         self.dof = np.array([[model.joint(f"{n}_{a}").dofadr[0] for a in "xyz"] for n in names])
         self.act = np.array([[model.actuator(f"{n}_{a}").id for a in "xyz"] for n in names])
+        self.target = model.actuator_actadr[self.act]
         self.lead = hand.damping / hand.stiffness
 
     def place(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> None:
         """Put the hand at landmarks (21, 3) m, moving at velocity (21, 3) m/s, and its targets there too."""
         data.qpos[self.qpos] = self.weights @ joints
         data.qvel[self.dof] = 0.0 if velocity is None else self.weights @ velocity
-        data.ctrl[self.act] = self.weights @ joints
+        data.act[self.target] = self.weights @ joints
+        data.ctrl[self.act] = 0.0
 
     def control(self, data: mujoco.MjData, joints: np.ndarray) -> None:
         """Aim at landmarks (21, 3) m within the limit of the whole hand's force."""
@@ -134,7 +140,8 @@ class PointsController:
         # In free motion the pull only carries the spheres' own mass; it counts against the limit all the same.
         if total > self.hand.total_force:
             target = here + (pull * (self.hand.total_force / total) + drag) / self.hand.stiffness
-        data.ctrl[self.act] = target
+        data.act[self.target] = target
+        data.ctrl[self.act] = 0.0
 
     def landmarks(self, data: mujoco.MjData) -> np.ndarray:
         """(21, 3) where the landmarks are, m, asset frame; a copy."""
