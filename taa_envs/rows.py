@@ -23,12 +23,14 @@ MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping
 
 
 class Rows(Protocol):
-    """``n`` simulations. Arrays are live: ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``time`` (n,),
-    ``sensordata`` (n, nsensordata; of the state before the last step)."""
+    """``n`` simulations. Arrays are live: ``qpos`` (n, nq), ``qvel`` (n, nv), ``act`` (n, na), ``ctrl`` (n, nu),
+    ``time`` (n,), ``sensordata`` (n, nsensordata; of the state before the last step), ``history`` (n, nhistory)."""
 
     n: int
     qpos: np.ndarray
     qvel: np.ndarray
+    act: np.ndarray
+    history: np.ndarray
     ctrl: np.ndarray
     sensordata: np.ndarray
 

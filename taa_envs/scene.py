@@ -121,9 +121,9 @@ def _add_cameras(spec: mujoco.MjSpec, asset: Asset, swept: np.ndarray) -> None:
 def _add_touch(spec: mujoco.MjSpec) -> None:
     """Sensors of what touches the moving link: ``touch`` the net wrench, ``touch_depth`` the deepest contact.
 
-    Only a hand can touch it, see the module's text. A sensor costs a fraction of reading contacts in Python. MuJoCo keeps
-    what ``touch`` said in each of the last :data:`SUBSTEPS` steps (:func:`touch_history`), so that many steps can be made
-    in one call without losing what touched in between.
+    Only a hand can touch it, see the module's text. A sensor costs a fraction of reading contacts in Python. MuJoCo
+    keeps what ``touch`` said in each of the last :data:`SUBSTEPS` steps (:func:`touch_history`), so that many steps can
+    be made in one call without losing what touched in between.
     """
     import mujoco
 
