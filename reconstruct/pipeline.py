@@ -319,6 +319,9 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
         return built
 
     geometry: Geometry = stages.run("geometry", shape, ("geometry",), options={"meshes": meshes})
+    if "masks" in given and len(meshes) == len(cues_io.MESHES):
+        fit, geometry, words = _refine(video, tracks, fit, geometry, masks, stages)
+        seen = replace(seen, fit=fit, notes=(*seen.notes, words))
     reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
     if folder:
         folder.write("masks", cues_io.mask_arrays(masks))
@@ -351,6 +354,22 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
         with written_whole(scene / "report.html") as partial:
             partial.write_bytes((final / "report.html").read_bytes())
     return ReconstructResult(id, asset, joint_object(fit, video.index), result.as_dict(), stages.seconds, tuple(notes))
+
+
+def _refine(video: Video, tracks: Tracks, fit: JointFit, geometry: Geometry, masks: LinkMasks,
+            stages: Stages) -> tuple[JointFit, Geometry, str]:  # fmt: skip
+    """The joint and the meshes' place by the masks: for masks and meshes that were not cut by the joint itself."""
+    from reconstruct.refine import Mesh, Refinement, moved, refine_joint
+
+    links = {"static": geometry.static, "moving": geometry.moving}
+    meshes = {name: Mesh(link.vertices, link.faces) for name, link in links.items()}
+    got: Refinement = stages.run(
+        "refine", lambda: refine_joint(fit, tracks, meshes, masks, video.size), ("refine",), keep=False
+    )
+    moved_px = f"outline {got.before['mask_px']:.2f} -> {got.after['mask_px']:.2f} px at 240 px width"
+    if not got.after["mask_px"] < got.before["mask_px"]:
+        return fit, geometry, f"image-space refinement did not bring the outline closer ({moved_px}); not used"
+    return got.fit, moved(geometry, got), f"joint and meshes refined against the masks: {moved_px}"
 
 
 def fit_scene(scene: str | Path, focal: float | None = None, seed: int = 0, progress: Progress | None = None) -> dict:
