@@ -95,6 +95,8 @@ class HandReference:
         contact: (T,) bool, the frames in which the hand drives the part.
         side: "left" or "right".
         notes: what was assumed or could not be done.
+        std: standard deviations of what stays open about the driving hand: ``depth`` and ``across`` (m, along and
+            across the viewing ray), ``size`` (relative), ``time`` (s), ``tips`` (m, a finger tip); empty without one.
     """
 
     time: np.ndarray
@@ -104,3 +106,4 @@ class HandReference:
     contact: np.ndarray
     side: str
     notes: tuple[str, ...] = field(default_factory=tuple)
+    std: dict[str, float] = field(default_factory=dict)

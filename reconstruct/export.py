@@ -58,7 +58,8 @@ def refused_joint(reason: str) -> dict:
     return joint_object(JointFit("refused", reason), None)
 
 
-def number_origins(video: Video, fit: JointFit, geometry: Geometry, focal_given: bool) -> dict[str, dict]:
+def number_origins(video: Video, fit: JointFit, geometry: Geometry, focal_given: bool,
+                   reference: HandReference | None = None) -> dict[str, dict]:  # fmt: skip
     """Provenance of the numbers that are neither the joint's nor assumed while writing the asset."""
     focal_origin = "given" if focal_given else "observed" if video.focal_px else "fitted"
     made = {
@@ -75,6 +76,10 @@ def number_origins(video: Video, fit: JointFit, geometry: Geometry, focal_given:
     }  # fmt: skip
     if fit.residual_px is not None:
         made["joint.residual_px"] = {"value": fit.residual_px, "unit": "px", "origin": "observed"}
+    units = {"size": "1", "time": "s"}
+    for name, std in (reference.std if reference is not None else {}).items():
+        made[f"hand.{name}"] = {"value": 0.0, "unit": units.get(name, "m"), "origin": "fitted", "std": std,
+                                "note": "correction of the demonstrated hand; reference.npz holds it at 0"}
     return plain({**made, **geometry.provenance})
 
 
@@ -100,7 +105,7 @@ def write_asset(root: Path, asset_id: str, video: Video, fit: JointFit, geometry
         reference=reference,
         camera={"K": np.asarray(fit.K, float).tolist(), "T_camera_world": np.asarray(fit.T_camera_world).tolist(),
                 "width": int(video.size[0]), "height": int(video.size[1])},
-        provenance=number_origins(video, fit, geometry, focal_given),
+        provenance=number_origins(video, fit, geometry, focal_given, reference),
         source={"file": video.path.name, "sha256": video.sha256, "width": int(video.size[0]),
                 "height": int(video.size[1]), "decoded_frames": int(video.decoded), "frames": len(video),
                 "seconds": float(video.time[-1] - video.time[0]), "cues_given": given},

@@ -129,9 +129,20 @@ class Replay(Common):
     """Hand that replays."""
     video: Path | None = None
     """MP4 file to write: the source video (where its scene is known) beside the replay."""
+    refine: bool = False
+    """Search for small corrections of the demonstrated hand, within its stated uncertainty, and keep what is found."""
+    seconds: float = 60.0
+    """With --refine: how long to search at most."""
+    seed: int = 0
+    """With --refine: seed of the draws."""
+    out: Path | None = None
+    """With --refine: folder of assets to write a copy with the refined reference into (default: the asset itself)."""
+    reference: Literal["demonstration", "refined"] = "demonstration"
+    """Which hand motion: as reconstructed, or what --refine found earlier."""
 
     def run(self) -> Outcome:
-        return commands.replay(self.id, self.hand, self.video)
+        return commands.replay(self.id, self.hand, self.video, self.refine, self.reference, self.out, self.seed,
+                               self.seconds)  # fmt: skip
 
 
 @dataclass(kw_only=True)

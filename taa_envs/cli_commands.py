@@ -6,6 +6,7 @@ Imports happen inside the functions, so that ``taa list`` does not wait for Open
 from __future__ import annotations
 
 import csv
+import dataclasses
 import sys
 import time
 from collections.abc import Callable
@@ -168,23 +169,54 @@ def view(asset_id: str, port: int) -> Outcome:
     return Outcome({"id": asset_id, "url": url}, lambda: None)
 
 
-def replay(asset_id: str, hand: str, video: Path | None) -> Outcome:
+def replay(asset_id: str, hand: str, video: Path | None, refining: bool, reference: str, out: Path | None, seed: int,
+           seconds: float) -> Outcome:  # fmt: skip
     from taa_envs import registry
+    from taa_envs.refined import with_reference, write_refinement
     from taa_envs.replay import replay as run
 
     asset = registry.get_asset(asset_id)
     if video is not None and not video.parent.is_dir():
         raise TaaEnvsError(f"no such folder: {video.parent}; make it first")
-    result = run(asset, hand)
-    data = result.as_dict()
+    if out is not None and not refining:
+        raise TaaEnvsError("--out is where --refine writes; give both or neither")
+    notes: list[str] = []
+    if refining:
+        from taa_envs.refine import refine
+
+        if reference != "demonstration":
+            raise TaaEnvsError("--refine begins with the demonstration; leave --reference out")
+        with StageBars() as bars:
+            bars.start("refine")
+            found = refine(asset, hand, seed=seed, seconds=seconds, progress=bars.update)
+            bars.finish(found.seconds, f"{found.rollouts} replays")
+        where = write_refinement(asset, found, out)
+        result = found.after
+        asset = dataclasses.replace(asset, reference=found.reference)
+        data = {**result.as_dict(), "refinement": {**found.as_dict(), "path": str(where)}}
+        if not found.changed:
+            notes.append("no correction within the stated uncertainty is better than the demonstration itself")
+        if not found.stated:
+            notes.append("the asset does not state how uncertain its hand is; common deviations were assumed")
+        notes.append(f'use it: gymnasium.make("TAA/{asset_id}", hand="{hand}", reference="refined")')
+    else:
+        asset = with_reference(asset, reference, hand)
+        result = run(asset, hand)
+        data = result.as_dict()
     if video is not None:
         from reconstruct.film import replay_video
 
         replay_video(asset, result, hand, video)
 
     def words() -> None:
-        _table(f"{asset_id}: open-loop replay, hand {hand}", replay_rows(data))
-        for note in result.notes:
+        if refining:
+            before = replay_rows(found.before.as_dict())
+            rows = [(name, old, new) for (name, old), (_, new) in zip(before, replay_rows(result.as_dict()),
+                                                                      strict=True)]  # fmt: skip
+            _table(f"{asset_id}: replay, hand {hand}", [("", "demonstration", "refined"), *rows], header=True)
+        else:
+            _table(f"{asset_id}: open-loop replay, hand {hand}", replay_rows(data))
+        for note in (*result.notes, *notes):
             print(f"note: {note}")
         if video is not None:
             print(f"video   {video}")

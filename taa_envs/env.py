@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from taa_envs.asset import Asset
+from taa_envs.refined import with_reference
 from taa_envs.registry import CONTROL_PERIOD, get_asset
 from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, goal_reward
 from taa_envs.rows import SingleRows
@@ -131,6 +132,7 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     asset: an id, a folder or an :class:`Asset`.  hand: name of a hand.  action, observation, reward: see above.
     randomize: default of the reset option.  render_mode: None, "rgb_array" or "depth_array".  camera: "video" (where
     the asset knows it) or "overview".  width, height: px.  touch_static: whether the hand touches the static link too.
+    reference: "demonstration", or "refined" for what `taa replay --refine` found for this hand.
 
     ## Version history
     ``TAA/<id>`` carries no version: the asset's folder says what it was made of.
@@ -142,12 +144,12 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
                  reward: str | Mapping[str, float] = "dense", render_mode: str | None = None,
                  camera: str | None = None, width: int | None = None, height: int = 480,
                  touch_static: bool = False, action: str = "residual", observation: str = "flat",
-                 randomize: Any = False) -> None:
+                 randomize: Any = False, reference: str = "demonstration") -> None:
         EzPickle.__init__(self, asset, hand, reward, render_mode, camera, width, height, touch_static, action,
-                          observation, randomize)
+                          observation, randomize, reference)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"no render mode is named {render_mode!r}; known: {self.metadata['render_modes']}")
-        self.asset = get_asset(asset)
+        self.asset = with_reference(get_asset(asset), reference, hand)
         if camera is None:
             camera = "video" if self.asset.camera is not None else "overview"
         elif camera not in ("overview", "video") or (camera == "video" and self.asset.camera is None):

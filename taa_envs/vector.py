@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from taa_envs.asset import Asset
 from taa_envs.env import ArticulationEnv, observe, spaces_of
+from taa_envs.refined import with_reference
 from taa_envs.registry import get_asset
 from taa_envs.registry import max_episode_steps as default_steps
 from taa_envs.rows import BatchRows
@@ -45,8 +46,8 @@ class BatchedArticulationEnv(VectorEnv):
     def __init__(self, asset: str | os.PathLike | Asset, num_envs: int = 1, max_episode_steps: int | None = None,
                  autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, threads: int = 0, hand: str = "points",
                  reward: str | Mapping[str, float] = "dense", action: str = "residual", observation: str = "flat",
-                 randomize: Any = False, touch_static: bool = False) -> None:
-        self.asset = get_asset(asset)
+                 randomize: Any = False, touch_static: bool = False, reference: str = "demonstration") -> None:
+        self.asset = with_reference(get_asset(asset), reference, hand)
         self.num_envs = num_envs
         if isinstance(autoreset_mode, str) and not isinstance(autoreset_mode, AutoresetMode):
             try:

@@ -15,15 +15,17 @@ import numpy as np
 from reconstruct.cues import HandReference, Hands, LinkMasks
 from reconstruct.geometry import Geometry
 from reconstruct.hand.drive import Drive, close_gaps, find_drive, moving_frames, runs
-from reconstruct.hand.grip import RADII, Grip, find_grips
+from reconstruct.hand.grip import ACROSS_STD, RADII, RAY_STD, Grip, find_grips
 from reconstruct.hand.path import clear_path, exit_direction
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.shape import LinkShape
-from reconstruct.hand.skeleton import HAND_SIZE_STD, TIPS, bone_lengths, with_bone_lengths
+from reconstruct.hand.skeleton import ADULT_SIZE_STD, HAND_SIZE_STD, TIPS, bone_lengths, with_bone_lengths
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
 FOUND_SECONDS = 0.15  # a hand that holds on so soon after it is found was holding on before
+DEPTH_FLOOR, ACROSS_FLOOR = 0.01, 0.005  # m, least standard deviations of an aligned hand
+TIPS_STD = 0.005  # m of a finger tip: landmark noise of 4 % of a palm, and the 4 mm by which tips are pressed in
 REST_STD = 0.015  # m, how still a driving hand's tips are in the link's frame
 
 
@@ -140,9 +142,12 @@ def _carried(drive: Drive, valid: np.ndarray, moving: np.ndarray, rate: float) -
     return out
 
 
-def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, masks: LinkMasks | None = None,
-               check: bool = True) -> HandReference:
-    """The demonstration: the driving hand in the world, as it really pushes the part.
+def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, masks: LinkMasks | None = None
+               ) -> HandReference:
+    """The demonstration: the driving hand in the world, where it can push the part.
+
+    The grip is chosen by what the video shows and the geometry allows; no simulation is looked at, so that a replay of
+    the reference is a test of it and not a result of having been selected for.
 
     Args:
         video: working frames (times only are used).
@@ -150,8 +155,6 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         fit: metric joint.
         geometry: both links; the moving one's collision parts are what the hand meets.
         masks: of the links; accepted for symmetry with the other stages, the geometry carries what is needed.
-        check: replay the candidate grips against the passive joint and keep the first that drives it while the
-            controls of the replay do not.
 
     Returns:
         The reference. Where no hand drives the part, ``hand_valid`` and ``contact`` are all False, the landmarks
@@ -194,32 +197,29 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     if not grips:
         notes.append("no face of the part looks against its motion within the hand's reach: pose left as seen")
         grips = [Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0, 0.0)]
-    made = [(grip, _assemble(fit, shape, world, pose, attached, grip, rest, rate)) for grip in grips]
-
-    def reference(joints: np.ndarray, words: list[str]) -> HandReference:
-        return HandReference(time.copy(), fit.q.copy(), joints, seen.valid & ~carried, attached & moving, hand.side,
-                             (*notes, *words))
-
-    chosen, progress = 0, None
-    if check:
-        from reconstruct.hand.check import replay_progress
-
-        scores = []
-        for _, joints in made:
-            scores.append(replay_progress(fit, geometry, reference(joints, [])))
-            if scores[-1][0] >= 0.9 and scores[-1][1] < 0.1:
-                break
-        chosen = int(np.argmax([done - max(control - 0.1, 0.0) for done, control in scores]))
-        progress = scores[chosen][0]
-    grip, joints = made[chosen]
-    words = [f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
-             f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was seen"]
+    grip = grips[0]
+    joints = _assemble(fit, shape, world, pose, attached, grip, rest, rate)
+    notes.append(f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
+                 f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was "
+                 "seen")
     if grip.hidden > 1:
-        words.append("the part would hide this hand from the camera: the geometry lacks what the hand really held")
-    if progress is not None:
-        words.append(f"replayed against the passive joint: progress {progress:.2f} with candidate {chosen + 1} "
-                     f"of {len(made)}")
-    return reference(joints, words)
+        notes.append("the part would hide this hand from the camera: the geometry lacks what the hand really held")
+    return HandReference(time.copy(), fit.q.copy(), joints, seen.valid & ~carried, attached & moving, hand.side,
+                         tuple(notes), _uncertainty(grip, ray, rate))
+
+
+def _uncertainty(grip: Grip, ray: np.ndarray, rate: float) -> dict[str, float]:
+    """What stays open about the demonstrated hand, standard deviations.
+
+    Observation and contact disagree by how far the hand had to be moved to its grip; that is what either may be off
+    by, and never less than what the landmarks themselves are.
+    """
+    ray = ray / np.linalg.norm(ray)
+    along = float(grip.shift @ ray)
+    aside = float(np.linalg.norm(grip.shift - along * ray))
+    return {"depth": min(float(np.hypot(DEPTH_FLOOR, along)), RAY_STD),
+            "across": min(float(np.hypot(ACROSS_FLOOR, aside)), ACROSS_STD),
+            "size": ADULT_SIZE_STD, "time": 1.0 / rate, "tips": TIPS_STD}
 
 
 def _stroke_sign(q: np.ndarray) -> float:

@@ -9,6 +9,8 @@ PARENT = np.array([0, 0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17
 TIPS = np.array([4, 8, 12, 16, 20])
 CONTACT = np.array([3, 4, 7, 8, 11, 12, 15, 16, 19, 20])
 """Finger tips and the joints before them: what usually touches."""
+ADULT_SIZE_STD = 0.07
+"""Relative spread of adult hand sizes."""
 HAND_SIZE_STD = 0.15
 """Relative error of every length that rests on a hand: adult hand sizes spread by 7 %, the network's finger directions
 add 13 % (rendered clips with a known hand: depth off by -20 to +16 %)."""
