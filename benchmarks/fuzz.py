@@ -312,7 +312,7 @@ def own_errors() -> tuple[type[Exception], ...]:
     return TaaError, TaaEnvsError
 
 
-def make_door(folder: Path) -> Path:
+def make_door(folder: Path, name: str = "door") -> Path:
     """A small asset to spoil: a door of two boxes."""
     import numpy as np
     import trimesh
@@ -338,7 +338,7 @@ def make_door(folder: Path) -> Path:
     joint = {"type": "revolute", "axis": [0.0, 0.0, 1.0], "point": [0.0, 0.0, 0.0], "verdict": "ok", "reason": "made"}
     return save_asset(
         folder,
-        "door",
+        name,
         joint=joint,
         static=Link((-0.2, 0, 0), (-0.1, 0.1, 0.5)),
         overwrite=True,

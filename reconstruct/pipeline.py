@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -66,6 +67,10 @@ class ReconstructResult:
                       "replay": self.replay, "seconds": self.seconds, "notes": list(self.notes)})  # fmt: skip
 
 
+class Stopped(Exception):
+    """The stage after which a run was to end is done."""
+
+
 @dataclass
 class Stages:
     """Runs stages: times them, tells their progress, and takes results that are still valid from the scene folder.
@@ -73,12 +78,14 @@ class Stages:
     Attributes:
         folder: ``scene/stages``, or None to keep nothing.
         inputs: what every stage depends on (the video's digest).
+        until: name of the last stage to run; :class:`Stopped` is raised after it.
         keys: the key of each stage that has run; a stage depends on all before it.
     """
 
     folder: Path | None
     progress: Progress
     inputs: dict[str, Any] = field(default_factory=dict)
+    until: str | None = None
     keys: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -107,6 +114,8 @@ class Stages:
         self.keys[name] = key
         self.seconds[name] = time.monotonic() - begin
         self.progress.finish(self.seconds[name], note)
+        if name == self.until:
+            raise Stopped(name)
         return value
 
 
@@ -125,7 +134,8 @@ class Seen:
 
 def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None, out: str | Path | None = None,
                 focal: float | None = None, providers: Mapping[str, str] | None = None, overwrite: bool = False,
-                seed: int = 0, progress: Progress | None = None) -> ReconstructResult:  # fmt: skip
+                seed: int = 0, progress: Progress | None = None, until: str | None = None
+                ) -> ReconstructResult:  # fmt: skip
     """One video of a hand moving an articulated object, as an asset folder.
 
     Args:
@@ -138,6 +148,8 @@ def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None
         overwrite: replace an asset of that id.
         seed: of everything that draws.
         progress: told about every stage.
+        until: end after the stage of that name, whose result stays in the scene folder; the result has then neither
+            asset nor error. For cues on one machine and the rest on another.
 
     Returns:
         The asset with its joint and replay, or a refusal with its reason.
@@ -158,9 +170,11 @@ def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None
     if final.exists() and not overwrite:
         raise AssetExists(f"{final} exists; choose another id or replace it with --overwrite")
     scene = Path(scene) if scene is not None else None
-    stages = Stages(scene / "stages" if scene else None, progress or Silent(), {"seed": seed, "providers": chosen})
-    with tempfile.TemporaryDirectory(prefix="taa-") as scratch:
+    stages = Stages(scene / "stages" if scene else None, progress or Silent(), {"seed": seed, "providers": chosen},
+                    until)  # fmt: skip
+    with tempfile.TemporaryDirectory(prefix="taa-") as scratch, contextlib.suppress(Stopped):
         return _reconstruct(Path(video_path), id, scene, final, focal, overwrite, seed, stages, Path(scratch))
+    return ReconstructResult(id, None, refused_joint(f"ended after the stage {until}"), None, stages.seconds)
 
 
 def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: float | None, overwrite: bool, seed: int,

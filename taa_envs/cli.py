@@ -239,6 +239,36 @@ class Diagnose(Common):
 
 
 @dataclass(kw_only=True)
+class Build(Common):
+    """Reconstruct every video below a folder; a run that was killed goes on, one bad video stops nothing."""
+
+    videos: tyro.conf.Positional[Path]
+    """Folder that holds videos at any depth."""
+    out: Path | None = None
+    """Folder of the build: manifest.csv, index.html, assets, scenes (default: <videos>_taa beside it)."""
+    engine: Literal["local", "ray"] = "local"
+    """Processes of this machine, or a Ray cluster ($RAY_ADDRESS, else a local one is started)."""
+    workers: int | None = None
+    """Videos at once (default: as many as cores and memory allow)."""
+    retries: int = 2
+    """Further tries for a video whose worker died."""
+    timeout: float = 3600.0
+    """Seconds after which a video is given up."""
+    again: tuple[Literal["failed", "refused", "done"], ...] = ()
+    """States of an earlier run to try again; what was left unfinished goes on in any case."""
+    focal: float | None = None
+    """Focal length of the upright full-size frame, px, if all videos share one."""
+    overwrite: bool = False
+    """Replace assets that are there."""
+    seed: int = 0
+    """Seed of everything that draws."""
+
+    def run(self) -> Outcome:
+        return commands.build(self.videos, self.out, self.engine, self.workers, self.retries, self.timeout, self.again,
+                              self.focal, self.overwrite, self.seed)  # fmt: skip
+
+
+@dataclass(kw_only=True)
 class Synth(Common):
     """Render videos with known ground truth."""
 
@@ -278,6 +308,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
+    | Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )

@@ -314,6 +314,42 @@ def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: boo
     return Outcome(result.data, words)
 
 
+def build(videos: Path, out: Path | None, engine: str, workers: int | None, retries: int, timeout: float,
+          again: tuple[str, ...], focal: float | None, overwrite: bool, seed: int) -> Outcome:  # fmt: skip
+    from rich.console import Console
+    from rich.markup import escape
+
+    from reconstruct.fleet import Build
+    from reconstruct.fleet import build as run
+
+    if workers is not None and workers < 1 or retries < 0 or not timeout > 0:
+        raise TaaEnvsError("--workers must be at least 1, --retries at least 0, --timeout positive; mend them")
+    videos = videos.resolve()
+    out = out if out is not None else videos.with_name(f"{videos.name}_taa")
+    err = Console(stderr=True, highlight=False)
+
+    def tell(row, counts: dict[str, int]) -> None:
+        ended = counts["done"] + counts["refused"] + counts["failed"]
+        words = row.result or row.error
+        share = f"{ended:>4}/{sum(counts.values())}"
+        err.print(f"{share}  {row.state:<8} {escape(row.id)}  {escape(words)}", soft_wrap=True)
+
+    manifest = run(Build(videos, out, engine, workers, retries, timeout, again, {}, focal, seed, overwrite), tell)
+    counts = manifest.counts()
+    rows = [(r.id, r.state, f"{r.seconds:.0f}", r.result or r.error) for r in manifest.rows.values()]
+    data = {"out": str(out), "counts": counts, "rows": [vars(r) for r in manifest.rows.values()],
+            "manifest": str(out / "manifest.csv"), "page": str(out / "index.html")}  # fmt: skip
+
+    def show() -> None:
+        _table(f"{videos.name}: " + ", ".join(f"{n} {state}" for state, n in counts.items() if n),
+               [("video", "state", "s", "result"), *rows], header=True)  # fmt: skip
+        print(f"page    {out / 'index.html'}")
+        print(f"table   {out / 'manifest.csv'}")
+        print(f"use     TAA_ASSETS={out / 'assets'}")
+
+    return Outcome(data, show)
+
+
 def synth(out: Path, clip: str | None, overwrite: bool, seed: int) -> Outcome:
     from reconstruct.synth import list_clips, render_clip
 
