@@ -94,9 +94,8 @@ def main() -> None:
             print(f"two Ray nodes, one killed when {told['done_when_killed']} videos had ended: {told['counts']}, "
                   f"{told['nodes_after']} node left, {told['seconds']:.0f} s")  # fmt: skip
             return
-        print(
-            "| engine | workers | videos | ended | s | videos an hour | speed-up |\n| --- | --- | --- | --- | --- | --- | --- |"
-        )
+        print("| engine | workers | videos | ended | s | videos an hour | speed-up |")
+        print("| --- | --- | --- | --- | --- | --- | --- |")
         plan = Build(args.videos, place)
         for engine in args.engines:
             first = None

@@ -61,8 +61,8 @@ def build(plan: Build, tell: Told | None = None) -> Manifest:
     """Reconstruct every video below a folder.
 
     A row that is done or refused stays as it is while its video and the options are the same; one that a killed build
-    left waiting or running goes on from what its scene folder holds. A worker that dies is tried again; a video that kills
-    every worker ends as ``failed`` and stops nothing.
+    left waiting or running goes on from what its scene folder holds. A worker that dies is tried again; a video that
+    kills every worker ends as ``failed`` and stops nothing.
 
     Args:
         plan: what to do.

@@ -41,8 +41,8 @@ def test_every_video_has_an_end(tmp_path: Path) -> None:
     told: list[str] = []
     rows = {r.video: r for r in build(work, lambda row, counts: told.append(f"{row.id} {row.state}")).rows.values()}
     assert {v: r.state for v, r in rows.items()} == {
-        "a/good.mp4": "done", "<b>good.mp4": "done", "once.mov": "done", "nothing.mkv": "refused", "poison.mp4": "failed",
-        "broken.avi": "failed", "odd.mp4": "failed", "hang.mp4": "failed"}  # fmt: skip
+        "a/good.mp4": "done", "<b>good.mp4": "done", "once.mov": "done", "nothing.mkv": "refused",
+        "poison.mp4": "failed", "broken.avi": "failed", "odd.mp4": "failed", "hang.mp4": "failed"}  # fmt: skip
     assert (
         "SIGSEGV" in rows["poison.mp4"].error
         and "2 times" in rows["poison.mp4"].error
@@ -95,15 +95,16 @@ def test_errors_before_anything_runs(tmp_path: Path) -> None:
             build(plan(tmp_path, ["good.mp4"]))
 
 
-def children(of: int) -> list[int]:
+def workers_of(mark: str) -> list[int]:
+    """Processes of jobs whose environment carries the mark."""
     found = []
-    for entry in Path("/proc").iterdir():
+    for entry in Path("/proc").glob("[0-9]*"):
         try:
-            if entry.name.isdigit() and b"reconstruct.fleet.job" in (entry / "cmdline").read_bytes() and str(of).encode() in (
-                    entry / "environ").read_bytes():  # fmt: skip
-                found.append(int(entry.name))
+            command, environment = (entry / "cmdline").read_bytes(), (entry / "environ").read_bytes()
         except OSError:
             continue
+        if b"reconstruct.fleet.job" in command and mark.encode() in environment:
+            found.append(int(entry.name))
     return found
 
 
@@ -111,8 +112,8 @@ def test_a_killed_build_leaves_no_worker_and_goes_on(tmp_path: Path) -> None:
     names = [f"slow{i}.mp4" for i in range(4)] + ["good.mp4"]
     work = plan(tmp_path, names)
     mark = f"killed-{os.getpid()}"
-    code = (f"from pathlib import Path; from reconstruct.fleet import Build, build; build(Build(Path({str(work.videos)!r}), "
-            f"Path({str(work.out)!r}), task={TASK!r}, workers=2))")  # fmt: skip
+    arguments = f"Path({str(work.videos)!r}), Path({str(work.out)!r}), task={TASK!r}, workers=2"
+    code = f"from pathlib import Path; from reconstruct.fleet import Build, build; build(Build({arguments}))"
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, env={**os.environ, "MARK": mark})
     deadline = time.monotonic() + 60
     while attempts(work, "slow0.mp4") + attempts(work, "slow1.mp4") + attempts(work, "good.mp4") < 2:
@@ -120,7 +121,7 @@ def test_a_killed_build_leaves_no_worker_and_goes_on(tmp_path: Path) -> None:
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    while [p for p in children(0) if mark.encode() in Path(f"/proc/{p}/environ").read_bytes()]:
+    while workers_of(mark):
         assert time.monotonic() < deadline
         time.sleep(0.1)
     states = {r["id"]: r["state"] for r in json.loads((work.out / "manifest.json").read_text())["rows"]}
