@@ -1,0 +1,139 @@
+"""The benchmark's command.
+
+    python -m benchmarks.articulation --rows 1 2 --out results.json          # all objects, motions, cameras
+    python -m benchmarks.articulation --rows 3 --objects laptop storage --motions open twice --cameras static
+    python -m benchmarks.articulation --table results.json                   # the table of results on disk
+
+Every case is a line of JSON in ``--out``; a second run with the same file goes on where the first one stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One estimate to make."""
+
+    model: str
+    motion: str
+    orbit: bool
+    small: bool
+    row: int
+    seed: int
+    focal_known: bool
+
+    @property
+    def key(self) -> str:
+        return f"{self.row}/{self.model}:{self.motion}:{'orbit' if self.orbit else 'static'}" + (
+            ":small" if self.small else ""
+        )
+
+
+@cache
+def _models() -> dict:
+    from benchmarks.articulation.objects import all_models
+
+    return {m.name: m for m in all_models()}
+
+
+@cache
+def _scene(model: str, motion: str, orbit: bool, small: bool, seed: int):
+    from benchmarks.articulation.scenes import make_scene
+
+    return make_scene(_models()[model], motion, orbit, small, seed)
+
+
+def run(case: Case) -> dict:
+    """Make, solve and score one case."""
+    from benchmarks.articulation.bound import bound
+    from benchmarks.articulation.engines import solve
+    from benchmarks.articulation.noise import give
+    from benchmarks.articulation.scenes import Hidden
+    from benchmarks.articulation.scores import score
+
+    try:
+        scene = _scene(case.model, case.motion, case.orbit, case.small, case.seed)
+    except Hidden as reason:
+        return {"key": case.key, "left_out": str(reason)}
+    given = give(scene, case.row, case.seed)
+    best = bound(given, case.focal_known) if case.row > 1 else None
+    row = score(given, solve(given, best, case.focal_known, case.seed), best)
+    return {"key": case.key, "seed": case.seed, **row}
+
+
+def cases(args: argparse.Namespace) -> Iterator[Case]:
+    from benchmarks.articulation.motions import MOTIONS
+
+    names = [n for n in _models() if not args.objects or any(o == n or o == n.split("/")[0] for o in args.objects)]
+    for model in names:
+        for motion in args.motions or MOTIONS:
+            for camera in args.cameras:
+                for extent in args.extents:
+                    for row in args.rows:
+                        yield Case(model, motion, camera == "orbit", extent == "small", row, args.seed,
+                                   not args.focal_unknown)  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> int:
+    from benchmarks.articulation.table import markdown, worst
+
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.articulation", description=__doc__.split("\n")[0])
+    parser.add_argument("--rows", type=int, nargs="+", default=[1, 2, 3], choices=[1, 2, 3])
+    parser.add_argument("--objects", nargs="*", help="names or models; all when left out")
+    parser.add_argument("--motions", nargs="*", help="open half close return pause hurry twice; all when left out")
+    parser.add_argument("--cameras", nargs="+", default=["static", "orbit"], choices=["static", "orbit"])
+    parser.add_argument("--extents", nargs="+", default=["full", "small"], choices=["full", "small"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--limit", type=int, help="at most so many cases, spread evenly over all that were asked for")
+    parser.add_argument("--focal-unknown", action="store_true", help="row 3: do not give the focal length")
+    parser.add_argument("--out", type=Path, help="JSON lines, one a case; appended to")
+    parser.add_argument("--table", type=Path, help="print the table of such a file and stop")
+    args = parser.parse_args(argv)
+    if args.table:
+        rows = [json.loads(line) for line in args.table.read_text().splitlines()]
+        rows = [r for r in rows if "left_out" not in r]
+        print(markdown(rows))
+        print(worst(rows), file=sys.stderr)
+        return 0
+    todo = list(cases(args))
+    if args.limit and args.limit < len(todo):
+        step = len(todo) / args.limit
+        todo = [todo[int(k * step)] for k in range(args.limit)]
+    rows = []
+    if args.out and args.out.is_file():
+        rows = [json.loads(line) for line in args.out.read_text().splitlines()]
+        done = {r["key"] for r in rows}
+        todo = [c for c in todo if c.key not in done]
+    with ProcessPoolExecutor(args.workers) as pool:
+        jobs = pool.map(run, todo) if args.workers > 1 else map(run, todo)
+        for k, row in enumerate(jobs, 1):
+            rows.append(row)
+            if args.out:
+                with args.out.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+            if k % 20 == 0 or k == len(todo):
+                print(f"{k} of {len(todo)}", file=sys.stderr, flush=True)
+    left_out = sorted({r["left_out"] for r in rows if "left_out" in r})
+    rows = [r for r in rows if "left_out" not in r]
+    print(markdown(rows))
+    for reason in left_out:
+        print(f"left out: {reason}", file=sys.stderr)
+    print(worst(rows), file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

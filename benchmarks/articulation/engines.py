@@ -1,0 +1,134 @@
+"""The project's own estimators on the benchmark's cases, their answers brought into the world of the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.articulation.bound import Bound
+from benchmarks.articulation.motions import SIZE
+from benchmarks.articulation.noise import Given
+from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint.models import JointFit
+from reconstruct.video import Video
+
+PROVIDER = ProviderInfo("benchmark", "1", "Apache-2.0")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an estimator said, in the world of the truth.
+
+    Attributes:
+        verdict, reason: of the fit; verdict "failed" if it raised.
+        type, probability: as stated.
+        axis: (3,), point: (3,) or None, q: (T,) with q[0] = 0 in rad or m; None if refused.
+        link_pose: (T, 4, 4) of the moving link relative to frame 0.
+        std: "axis_deg", "point_m", "q" as stated, lengths in m.
+        seconds: of the fit.
+    """
+
+    verdict: str
+    reason: str
+    type: str | None = None
+    probability: dict[str, float] = field(default_factory=dict)
+    axis: np.ndarray | None = None
+    point: np.ndarray | None = None
+    q: np.ndarray | None = None
+    link_pose: np.ndarray | None = None
+    std: dict = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def solve(given: Given, best: Bound | None, focal_known: bool = True, seed: int = 0) -> Answer:
+    """Run the estimator that fits the row: with 3D tracks in rows 1 and 2, without depth in row 3."""
+    begin = time.perf_counter()
+    try:
+        fit = _with_depth(given, seed) if given.depth is not None else _without_depth(given, focal_known, seed)
+    except Exception as error:  # whatever goes wrong is a failed case, not the end of the table
+        return Answer("failed", f"{type(error).__name__}: {error}", seconds=time.perf_counter() - begin)
+    seconds = time.perf_counter() - begin
+    if fit.axis is None or fit.verdict == "refused":
+        return Answer("refused", fit.reason, fit.type, fit.type_probability, seconds=seconds)
+    scale, T_true_fit = 1.0, np.eye(4)
+    if given.depth is None:
+        registered = _registration(fit, given, best)
+        if registered is None:
+            return Answer("failed", "none of the points it takes for the link is on the link", fit.type,
+                          fit.type_probability, seconds=seconds)  # fmt: skip
+        scale, T_true_fit = registered
+    R, t = T_true_fit[:3, :3], T_true_fit[:3, 3]
+    place = lambda x: scale * (x @ R.T) + t  # noqa: E731
+    q = _all_frames(fit, len(given.scene.shot.q))
+    poses = fit.link_pose(q)
+    T = np.tile(np.eye(4), (len(q), 1, 1))
+    T[:, :3, :3] = R @ poses[:, :3, :3] @ R.T
+    T[:, :3, 3] = scale * poses[:, :3, 3] @ R.T + t - np.einsum("tij,j->ti", T[:, :3, :3], t)
+    unit = scale if fit.type == "prismatic" else 1.0
+    std = dict(fit.std)
+    std["point_m"] = scale * std.get("point_m", np.nan)
+    std["q"] = unit * np.asarray(std.get("q", np.full(len(fit.q), np.nan)), float)
+    if len(std["q"]) != len(q):
+        std["q"] = np.interp(np.arange(len(q)), np.asarray(fit.frames, float), std["q"])
+    point = None if fit.point is None else place(fit.point)
+    return Answer(fit.verdict, fit.reason, fit.type, fit.type_probability, R @ fit.axis, point, q * unit, T, std,
+                  seconds)  # fmt: skip
+
+
+def _with_depth(given: Given, seed: int) -> JointFit:
+    from reconstruct.joint.rigid import fit_rigid
+
+    shot = given.scene.shot
+    return fit_rigid(given.uv, given.visible, given.depth, shot.K, shot.T_world_camera, given.link, seed=seed)
+
+
+def _without_depth(given: Given, focal_known: bool, seed: int) -> JointFit:
+    from reconstruct.joint.fit import fit_joint
+
+    T = given.uv.shape[1]
+    blank = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
+    video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, blank, 1.0)
+    tracks = Tracks(given.uv.astype(np.float32), given.visible, given.scene.seed, PROVIDER)
+    return fit_joint(video, tracks, float(given.scene.shot.K[0, 0]) if focal_known else None, seed)
+
+
+def _registration(fit: JointFit, given: Given, best: Bound | None) -> tuple[float, np.ndarray] | None:
+    """Scale and pose that take a fit up to scale into the true world: both see the same first camera.
+
+    The scale is the weighted median ratio of depths, true over fitted, of the moving points of the fit;
+    None if it has no point that is right.
+    """
+    shot, scene = given.scene.shot, given.scene
+    T_world_camera = shot.T_world_camera[0]
+    T_camera_fit = np.asarray(fit.T_camera_world, float)
+    ratio, weight = np.ones(1), np.ones(1)
+    if fit.points is not None and fit.point_track is not None:
+        ids = np.asarray(fit.point_track, int)
+        on = scene.moving[ids] & ~given.wrong[ids].any(1)
+        ids, points = ids[on], fit.points[on]
+        z_fit = points @ T_camera_fit[2, :3] + T_camera_fit[2, 3]
+        z_true = (scene.points[ids] - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+        ratio = z_true / z_fit
+        weight = best.scale_weight[ids] if best is not None else np.ones(len(ids))
+        ok = np.isfinite(ratio) & (ratio > 0)
+        ratio, weight = ratio[ok], weight[ok] + 1e-12
+    if len(ratio) == 0:
+        return None
+    order = np.argsort(ratio)
+    share = np.cumsum(weight[order]) / weight.sum()
+    scale = float(ratio[order][np.searchsorted(share, 0.5)])
+    # x_true = R_wc (scale * (R_cf x + t_cf)) + t_wc
+    out = np.eye(4)
+    out[:3, :3] = T_world_camera[:3, :3] @ T_camera_fit[:3, :3]
+    out[:3, 3] = scale * T_world_camera[:3, :3] @ T_camera_fit[:3, 3] + T_world_camera[:3, 3]
+    return scale, out
+
+
+def _all_frames(fit: JointFit, T: int) -> np.ndarray:
+    q = np.asarray(fit.q, float)
+    if len(q) != T:
+        q = np.interp(np.arange(T), np.asarray(fit.frames, float), q)
+    return q - q[0]
