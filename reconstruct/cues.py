@@ -12,11 +12,18 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ProviderInfo:
-    """Who made a cue: carried into ``asset.json``."""
+    """Who made a cue: carried into ``asset.json``.
+
+    Attributes:
+        name, version: of the provider; where it has weights, the version names them.
+        licence: of its code and weights.
+        stage: what it made ("track", "depth", ...), or "".
+    """
 
     name: str
     version: str
     licence: str
+    stage: str = ""
 
 
 @dataclass(frozen=True)

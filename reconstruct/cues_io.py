@@ -1,7 +1,8 @@
 """The scene folder's ``cues/``: files that other programs may write and read, in the contract's format.
 
-The pipeline writes its own cues there and remembers their digests in ``cues/written.json``. A file that is
-not as the pipeline wrote it was put there by somebody, and is used as if a provider had made it.
+The pipeline writes its own cues there and remembers their digests in ``cues/written.json``; those of chosen
+providers and of an imported scene are remembered in ``cues/made.json`` with who made them. A file that is in neither
+as it was written was put there by somebody, and is used as if a provider had made it.
 """
 
 from __future__ import annotations
@@ -48,25 +49,84 @@ class CueFolder:
 
     Args:
         scene: the scene folder; it may not exist yet.
+        chosen: stage -> provider of this run. A cue that another provider made earlier is then not used; None uses all.
     """
 
-    def __init__(self, scene: Path) -> None:
+    def __init__(self, scene: Path, chosen: Mapping[str, str] | None = None) -> None:
         self.folder = Path(scene) / "cues"
-        self._ledger_file = self.folder / "written.json"
-        try:
-            ledger = json.loads(self._ledger_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
-            ledger = None
-        self._written: dict[str, str] = ledger if isinstance(ledger, dict) else {}
+        self._ledger_file, self._made_file = self.folder / "written.json", self.folder / "made.json"
+        self._written: dict[str, str] = _read_ledger(self._ledger_file)
+        self._made: dict[str, dict] = _read_ledger(self._made_file)
+        self._chosen = chosen
 
     def given(self) -> dict[str, str]:
-        """Name (``"tracks"``, ``"meshes/moving.glb"``) -> sha256 of every cue that the pipeline did not write."""
+        """Name (``"tracks"``, ``"meshes/moving.glb"``) -> sha256 of every cue the pipeline did not write itself."""
         found = {}
         for name in (*NAMES, *MESHES):
             file = self._file(name)
             if file.is_file() and (digest := file_digest(file)) != self._written.get(name):
-                found[name] = digest
+                made = self._made.get(name, {})
+                if made.get("sha256") != digest or self._wanted(made):
+                    found[name] = digest
         return found
+
+    def users(self, name: str) -> bool:
+        """True if this file is there and neither the pipeline nor a provider made it."""
+        file = self._file(name)
+        known = (self._written.get(name), self._made.get(name, {}).get("sha256"))
+        return file.is_file() and (self.imported(name) or file_digest(file) not in known)
+
+    def imported(self, name: str) -> bool:
+        """True if the file came with an imported scene."""
+        made = self._made.get(name, {})
+        file = self._file(name)
+        return bool(made) and not made.get("stage") and file.is_file() and file_digest(file) == made["sha256"]
+
+    def fresh(self, name: str, key: str) -> bool:
+        """True if the file is as a provider made it under this key."""
+        made = self._made.get(name, {})
+        file = self._file(name)
+        return made.get("key") == key and file.is_file() and file_digest(file) == made.get("sha256")
+
+    def maker(self, name: str) -> ProviderInfo:
+        """Who made a cue; the user where nobody is known."""
+        made = self._made.get(name, {})
+        file = self._file(name)
+        if not made or not file.is_file() or file_digest(file) != made.get("sha256"):
+            return replace(GIVEN, stage=name)
+        return ProviderInfo(made["name"], made["version"], made["licence"], made.get("stage") or name)
+
+    def put(self, name: str, content: Arrays | bytes, maker: ProviderInfo, key: str = "") -> None:
+        """Write a cue that a provider made, or that was imported (no key), and remember who made it."""
+        file = self._file(name)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(content, bytes):
+            with written_whole(file) as partial:
+                partial.write_bytes(content)
+        else:
+            save_npz(file, content)
+        self._written.pop(name, None)
+        self._made[name] = {"sha256": file_digest(file), "key": key, "stage": maker.stage if key else "",
+                            "name": maker.name, "version": maker.version, "licence": maker.licence}  # fmt: skip
+        for ledger, content in ((self._made_file, self._made), (self._ledger_file, self._written)):
+            with written_whole(ledger) as partial:
+                partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+    def path(self, name: str) -> Path:
+        """The file of a cue."""
+        return self._file(name)
+
+    def _wanted(self, made: Mapping[str, str]) -> bool:
+        stage = made.get("stage")
+        return not stage or self._chosen is None or self._chosen.get(stage) == made["name"]
+
+    def _ours(self, name: str) -> bool:
+        """True if the pipeline may write over the file: nothing is there, or what it or an unused provider wrote."""
+        file = self._file(name)
+        if not file.is_file():
+            return True
+        digest, made = file_digest(file), self._made.get(name, {})
+        return digest == self._written.get(name) or (digest == made.get("sha256") and not self._wanted(made))
 
     def read(self, name: str, *required: str) -> dict[str, np.ndarray]:
         """All arrays of a cue.
@@ -87,11 +147,9 @@ class CueFolder:
 
     def write(self, name: str, arrays: Arrays) -> None:
         """Write one of the pipeline's own cues; a user's file of that name is left alone."""
-        file = self._file(name)
-        if file.is_file() and file_digest(file) != self._written.get(name):
-            return
-        save_npz(file, arrays)
-        self._remember(name)
+        if self._ours(name):
+            save_npz(self._file(name), arrays)
+            self._remember(name)
 
     def write_meshes(self, geometry: Geometry) -> None:
         """Both links as binary glTF, world frame, moving at q = 0."""
@@ -99,7 +157,7 @@ class CueFolder:
 
         for name, link in zip(MESHES, (geometry.static, geometry.moving), strict=True):
             file = self._file(name)
-            if file.is_file() and file_digest(file) != self._written.get(name):
+            if not self._ours(name):
                 continue
             file.parent.mkdir(parents=True, exist_ok=True)
             mesh = trimesh.Trimesh(link.vertices, link.faces, vertex_colors=link.colors, process=False)
@@ -114,6 +172,14 @@ class CueFolder:
         self._written[name] = file_digest(self._file(name))
         with written_whole(self._ledger_file) as partial:
             partial.write_text(json.dumps(self._written, indent=1), encoding="utf-8")
+
+
+def _read_ledger(file: Path) -> dict:
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def expect_shape(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.ndarray:
@@ -168,7 +234,7 @@ def booleans(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.
     return expect_shape(np.asarray(array, bool), shape, what)
 
 
-def tracks_from_cue(cue: Arrays, frames: int) -> Tracks:
+def tracks_from_cue(cue: Arrays, frames: int, maker: ProviderInfo = GIVEN) -> Tracks:
     """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T)); seeded where first visible."""
     uv = numbers(cue["uv"], (None, frames, 2), "uv of cues/tracks.npz")
     if not len(uv):
@@ -176,10 +242,11 @@ def tracks_from_cue(cue: Arrays, frames: int) -> Tracks:
     visible = booleans(cue["visible"], uv.shape[:2], "visible of cues/tracks.npz")
     visible = visible & (np.abs(np.nan_to_num(uv, nan=np.inf)) < MAX_PX).all(-1)
     uv = np.where(visible[..., None], uv, np.nan)
-    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), GIVEN)
+    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), maker)
 
 
-def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.ndarray | None) -> Hands:
+def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.ndarray | None,
+                   maker: ProviderInfo = GIVEN) -> Hands:  # fmt: skip
     """The hand of ``hand.npz``, its joints turned from the world to each frame's camera axes.
 
     Args:
@@ -210,7 +277,7 @@ def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.nd
         from reconstruct.providers.skin import hand_mask
 
         mask = hand_mask(video, (track,))
-    return Hands((track,), mask, GIVEN)
+    return Hands((track,), mask, maker)
 
 
 def masks_from_cue(cue: Arrays, video: Video) -> LinkMasks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,6 +110,6 @@ def write_asset(root: Path, asset_id: str, video: Video, fit: JointFit, geometry
         source={"file": video.path.name, "sha256": video.sha256, "width": int(video.size[0]),
                 "height": int(video.size[1]), "decoded_frames": int(video.decoded), "frames": len(video),
                 "seconds": float(video.time[-1] - video.time[0]), "cues_given": given},
-        providers=[{"name": p.name, "version": p.version, "licence": p.licence} for p in providers],
+        providers=[{key: value for key, value in asdict(p).items() if key != "stage" or value} for p in providers],
         notes=list(dict.fromkeys(notes)), files=dict(files or {}),
     )  # fmt: skip

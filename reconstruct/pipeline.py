@@ -80,6 +80,7 @@ class Stages:
         inputs: what every stage depends on (the video's digest).
         until: name of the last stage to run; :class:`Stopped` is raised after it.
         keys: the key of each stage that has run; a stage depends on all before it.
+        chosen: stage -> provider.  notes: what providers had to say.
     """
 
     folder: Path | None
@@ -88,6 +89,21 @@ class Stages:
     until: str | None = None
     keys: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    chosen: Mapping[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def provide(self, stage: str, cue: str, video: Video, scene: Path | None, seed: int, **inputs: Any) -> None:
+        """Let the chosen provider of a stage make its cue; the embedded ones run inside the pipeline's own stages."""
+        from reconstruct.providers.make import provide, request_for
+        from reconstruct.providers.table import is_default
+
+        name = self.chosen.get(stage)
+        if scene is None or name is None or is_default(stage, name):
+            return
+        request = replace(request_for(video, scene, self.chosen, seed, self.progress.update), **inputs)
+        label = f"{stage}: {name}"
+        self.notes += self.run(label, lambda: provide(stage, cue, request), keep=False)
+        self.keys.pop(label)  # the cue's digest stands for it
 
     def run(self, name: str, make: Callable[[], Any], code: tuple[str, ...] = (), keep: bool = True,
             options: Mapping[str, Any] | None = None, given: str | None = None) -> Any:  # fmt: skip
@@ -144,7 +160,7 @@ def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None
         scene: folder that keeps cues and results; a second run takes from it what is still valid.
         out: folder of assets, default the user's data folder.
         focal: focal length of the upright full-size frame, px.
-        providers: cue ("hand", "track", ...) -> name of a provider.
+        providers: stage ("hand", "track", ...) -> name of a provider, see ``taa doctor``.
         overwrite: replace an asset of that id.
         seed: of everything that draws.
         progress: told about every stage.
@@ -157,7 +173,7 @@ def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None
     Raises:
         TaaError, taa_envs.TaaEnvsError: the request cannot be met (no such file, id taken, ...).
     """
-    from reconstruct.providers.table import choose
+    from reconstruct.providers.table import choose, is_default
     from taa_envs.asset import AssetExists, check_id
     from taa_envs.registry import user_folder
 
@@ -170,9 +186,10 @@ def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None
     if final.exists() and not overwrite:
         raise AssetExists(f"{final} exists; choose another id or replace it with --overwrite")
     scene = Path(scene) if scene is not None else None
-    stages = Stages(scene / "stages" if scene else None, progress or Silent(), {"seed": seed, "providers": chosen},
-                    until)  # fmt: skip
+    stages = Stages(scene / "stages" if scene else None, progress or Silent(), {"seed": seed}, until, chosen=chosen)
     with tempfile.TemporaryDirectory(prefix="taa-") as scratch, contextlib.suppress(Stopped):
+        if scene is None and not all(is_default(stage, name) for stage, name in chosen.items()):
+            scene = Path(scratch) / "scene"  # the cues of chosen providers need a place
         return _reconstruct(Path(video_path), id, scene, final, focal, overwrite, seed, stages, Path(scratch))
     return ReconstructResult(id, None, refused_joint(f"ended after the stage {until}"), None, stages.seconds)
 
@@ -199,7 +216,7 @@ def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: fl
             with written_whole(scene / "report.html") as partial:
                 partial.write_text(page, encoding="utf-8")
         return ReconstructResult(id, None, joint, None, stages.seconds, notes, str(refusal))
-    return _build(id, scene, final, overwrite, seen, stages)
+    return _build(id, scene, final, overwrite, seed, seen, stages)
 
 
 def with_advice(reason: str) -> str:
@@ -215,30 +232,36 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     from reconstruct.providers.lk_tracks import track_points
     from reconstruct.providers.mediapipe_hand import detect_hands
 
-    folder = cues_io.CueFolder(scene) if scene is not None else None
-    given = folder.given() if folder else {}
-    camera = folder.read("camera", "K") if folder and "camera" in given else None
-    stages.inputs.update(video=video.sha256, frames=[len(video), *video.frames.shape[1:3]], camera=given.get("camera"))
-    if folder and scene:
-        folder.write("frames", {"time": video.time})
+    stages.inputs.update(video=video.sha256, frames=[len(video), *video.frames.shape[1:3]])
+    if scene is not None:
+        cues_io.CueFolder(scene, stages.chosen).write("frames", {"time": video.time})
         cues_io.save_facts(scene, video)
 
     stable, _ = stages.run("camera", lambda: stabilise(video, scratch, seed), ("motion.py",), keep=False)
+    # Every cue refers to the same pixels: providers look at the stabilised video, as all else does.
+    for stage in ("camera", "depth"):
+        stages.provide(stage, stage, stable, scene, seed)
+    stages.provide("hand", "hand", stable, scene, seed)
+    folder = cues_io.CueFolder(scene, stages.chosen) if scene is not None else None
+    given = folder.given() if folder else {}
+    camera = folder.read("camera", "K") if folder and "camera" in given else None
+    stages.inputs.update(camera=given.get("camera"))
     notes = list(dict.fromkeys([*video.notes, *stable.notes]))
 
     def find_hands() -> Hands:
         if folder is None or "hand" not in given:
             return detect_hands(stable, stages.progress.update)
         mask = None
-        if "masks" in given:
+        if folder.users("masks"):
             mask = cues_io.mask_at_work_size(folder.read("masks", "hand")["hand"], stable, "hand")
-        return cues_io.hands_from_cue(folder.read("hand", *cues_io.HAND_ARRAYS), camera, stable, mask)
+        cue = folder.read("hand", *cues_io.HAND_ARRAYS)
+        return cues_io.hands_from_cue(cue, camera, stable, mask, folder.maker("hand"))
 
     hands = stages.run(
         "hands",
         find_hands,
         ("providers/mediapipe_hand.py", "providers/skin.py"),
-        given=given.get("hand") and given["hand"] + given.get("masks", ""),
+        given=given.get("hand") and given["hand"] + (given["masks"] if folder and folder.users("masks") else ""),
     )
     if not hands.tracks:
         notes.append("no hand was seen; lengths are not metric and the replay has no hand to drive the part")
@@ -246,16 +269,22 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     def follow() -> Tracks:
         if folder is None or "tracks" not in given:
             return track_points(stable, hands, progress=stages.progress.update)
-        return cues_io.tracks_from_cue(folder.read("tracks", "uv", "visible"), len(stable))
+        return cues_io.tracks_from_cue(folder.read("tracks", "uv", "visible"), len(stable), folder.maker("tracks"))
 
+    stages.provide("track", "tracks", stable, scene, seed, hands=hands)
+    if folder and scene is not None:
+        folder = cues_io.CueFolder(scene, stages.chosen)
+        given = folder.given()
     tracks = stages.run("tracks", follow, ("providers/lk_tracks.py",), given=given.get("tracks"))
     if folder:
         folder.write("tracks", cues_io.track_arrays(tracks))
     fit, words = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
     if folder and fit.verdict != "refused":
         folder.write("camera", cues_io.camera_arrays(fit, len(stable)))
-    makers = tuple(dict.fromkeys([hands.provider, tracks.provider]))
-    return Seen(stable, hands, tracks, fit, makers, (*notes, *words), focal is not None or camera is not None)
+    makers = dict.fromkeys([hands.provider, tracks.provider])
+    if folder:
+        makers |= dict.fromkeys(folder.maker(name) for name in ("camera", "depth") if name in given)
+    return Seen(stable, hands, tracks, fit, tuple(makers), (*notes, *words), focal is not None or camera is not None)
 
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,
@@ -298,7 +327,8 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     return fit, notes
 
 
-def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen, stages: Stages) -> ReconstructResult:
+def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int, seen: Seen,
+           stages: Stages) -> ReconstructResult:  # fmt: skip
     """The stages from the joint to the asset: masks, geometry, hand, asset, replay, report."""
     from reconstruct.geometry.links import build_geometry
     from reconstruct.geometry.masks import segment_links
@@ -309,7 +339,8 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
     from taa_envs.replay import replay
 
     video, hands, tracks, fit = seen.video, seen.hands, seen.tracks, seen.fit
-    folder = cues_io.CueFolder(scene) if scene is not None else None
+    stages.provide("segment", "masks", video, scene, seed, hands=hands, tracks=tracks, fit=fit)
+    folder = cues_io.CueFolder(scene, stages.chosen) if scene is not None else None
     given = folder.given() if folder else {}
 
     def segment() -> LinkMasks:
@@ -318,6 +349,13 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
         return cues_io.masks_from_cue(folder.read("masks", "static", "moving", "hand"), video)
 
     masks = stages.run("masks", segment, ("geometry",), given=given.get("masks"))
+    stages.provide("mesh", cues_io.MESHES[1], video, scene, seed, hands=hands, tracks=tracks, fit=fit, masks=masks)
+    if scene is not None:
+        folder = cues_io.CueFolder(scene, stages.chosen)
+        given = folder.given()
+    makers = dict.fromkeys(seen.providers)
+    if folder:
+        makers |= dict.fromkeys(folder.maker(name) for name in ("masks", *cues_io.MESHES) if name in given)
     meshes = {name: given[name] for name in cues_io.MESHES if name in given}
 
     def shape() -> Geometry:
@@ -328,7 +366,8 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
             built = replace(build_geometry(video, hands, tracks, fit, masks), **links)
         if links:
             origin = {f"{name}_mesh": {"value": "cues/meshes", "origin": "given"} for name in links}
-            words = f"your mesh of the {' and the '.join(links)} link is taken as it is"
+            whose = "your" if folder and folder.maker(next(iter(meshes))).name == "given" else "the given"
+            words = f"{whose} mesh of the {' and the '.join(links)} link is taken as it is"
             built = replace(built, provenance={**built.provenance, **origin}, notes=(*built.notes, words))
         return built
 
@@ -341,7 +380,7 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
         folder.write("masks", cues_io.mask_arrays(masks))
         folder.write("hand", cues_io.hand_arrays(reference, hands))
         folder.write_meshes(geometry)
-    notes = list(dict.fromkeys([*seen.notes, *geometry.notes, *reference.notes]))
+    notes = list(dict.fromkeys([*seen.notes, *stages.notes, *geometry.notes, *reference.notes]))
     if not fit.metric:
         notes.append("no metric source; one unit of length is the moving part's median depth, taken as one metre")
     if fit.verdict == "ambiguous":
@@ -353,7 +392,7 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seen: Seen
         def save() -> Asset:
             work.rmdir()
             return write_asset(
-                work.parent, id, video, fit, geometry, reference, seen.providers, notes, seen.focal_given
+                work.parent, id, video, fit, geometry, reference, tuple(makers), notes, seen.focal_given
             )
 
         asset = stages.run("asset", save, keep=False)

@@ -47,24 +47,26 @@ class Reconstruct(Common):
     focal: float | None = None
     """Focal length of the upright full-size frame, px (default: metadata, else estimated with the joint)."""
     segment: str | None = None
-    """Provider of the link masks."""
+    """Provider of the link masks: motion, sam2, sam3 (`taa doctor` says which of these can run here)."""
     depth: str | None = None
-    """Provider of depth."""
+    """Provider of depth: none, da3, depth-anything-v2, moge."""
     track: str | None = None
-    """Provider of point tracks."""
+    """Provider of point tracks: lk, xfeat, cotracker3, trackcraft3r."""
     hand: str | None = None
-    """Provider of hands."""
+    """Provider of hands: mediapipe, hawor, wilor."""
     mesh: str | None = None
-    """Provider of link meshes."""
+    """Provider of link meshes: hull, sam3d."""
+    labels: str | None = None
+    """Provider of the part labels of whole meshes: votes, segvigen."""
     camera: str | None = None
-    """Provider of camera motion."""
+    """Provider of camera poses: none, colmap, da3."""
     overwrite: bool = False
     """Replace an asset of this id."""
     seed: int = 0
     """Seed of everything that draws."""
 
     def run(self) -> Outcome:
-        names = ("segment", "depth", "track", "hand", "mesh", "camera")
+        names = ("segment", "depth", "track", "hand", "mesh", "labels", "camera")
         chosen = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return commands.reconstruct(self.video, self.id, self.scene, self.out, self.focal, chosen, self.overwrite,
                                     self.seed)  # fmt: skip

@@ -381,14 +381,25 @@ def doctor(rendering: bool) -> Outcome:
     def words() -> None:
         print(f"Python {data['python']}, {data['machine']}")
         _table("packages", [(name, version or "not installed") for name, version in data["packages"].items()])
-        rows = [(p["cue"], p["name"], "runs" if p["runs"] else "cannot run", p["why"]) for p in data["providers"]]
-        _table("providers", rows)
+        rows = [(p["stage"], p["name"] + (" (default)" if p["default"] else ""), "yes" if p["runs"] else "no",
+                 p["why"], _licences(p), p["get"] + (f"; {p['apart']}" if p["apart"] else ""))
+                for p in data["providers"]]  # fmt: skip
+        head = ("stage", "provider", "runs here", "why not, or what to know", "licence", "how to get it")
+        _table("providers", [head, *rows], header=True)
+        if data["settings"]:
+            print(f"settings of the providers: {data['settings']}")
         print(
             "rendering: " + (data["rendering"]["backend"] if data["rendering"]["works"] else data["rendering"]["why"])
         )
         print("assets are looked for in " + ", ".join(data["assets"]))
 
     return Outcome(data, words)
+
+
+def _licences(provider: dict) -> str:
+    code, weights = provider["code_licence"], provider["weights_licence"]
+    words = f"code {code}" if weights == "-" else code if weights == code else f"code {code}; weights {weights}"
+    return words + ("; NON-COMMERCIAL" if provider["non_commercial"] else "")
 
 
 def train(asset_id: str, algo: str, steps: int | None, envs: int | None, config: Path | None, out: Path | None,

@@ -29,6 +29,7 @@ PACKAGES = (
     "stable-baselines3",
     "imageio-ffmpeg",
     "viser",
+    "transformers",
 )
 EGL_SENTENCE = (
     "off-screen rendering with EGL does not work here; install the system libraries libegl1 and libgl1-mesa-dri "
@@ -75,14 +76,21 @@ def versions() -> dict[str, str | None]:
 
 
 def provider_states() -> list[dict]:
-    """What makes each cue, with {"cue", "name", "runs", "why", "licence"}; needs the package ``reconstruct``."""
+    """What there is for each stage: :func:`reconstruct.providers.table.states`."""
     from reconstruct.providers.table import states
 
     return states()
 
 
+def _settings_file() -> str | None:
+    from reconstruct.providers.settings import settings_file
+
+    path = settings_file()
+    return str(path) if path else None
+
+
 def examine() -> dict:
-    """All of it: {"python", "machine", "packages", "rendering", "providers", "assets"}."""
+    """All of it: {"python", "machine", "packages", "rendering", "providers", "settings", "assets"}."""
     try:
         rendering = {"works": True, "backend": check_rendering(), "why": None}
     except TaaEnvsError as error:
@@ -95,5 +103,6 @@ def examine() -> dict:
         "packages": versions(),
         "rendering": rendering,
         "providers": provider_states(),
+        "settings": _settings_file(),
         "assets": [str(path) for path in registry.search_folders()],
     }

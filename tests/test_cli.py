@@ -140,7 +140,7 @@ def test_export_is_a_model_that_loads_by_itself(taa, tmp_path):
         (["no.mp4", "--id", "x"], "no such file"),
         (["text.mp4", "--id", "x"], "not a video"),
         (["text.mp4", "--id", "Not Legal"], "not valid"),
-        (["text.mp4", "--id", "x", "--hand", "wilor"], "known: mediapipe"),
+        (["text.mp4", "--id", "x", "--hand", "hamer"], "known: mediapipe"),
         (["text.mp4", "--id", "x", "--focal", "-3"], "focal length"),
         (["text.mp4", "--id", "taken", "--out", "out"], "--overwrite"),
     ],
@@ -201,7 +201,7 @@ def test_doctor_knows_the_providers(taa):
     code, out, _ = taa("doctor", "--json")
     data = json.loads(out)
     assert code == 0 and data["packages"]["mujoco"]
-    assert {"hand", "track", "segment", "depth", "mesh", "camera"} == {p["cue"] for p in data["providers"]}
+    assert {"hand", "track", "segment", "depth", "mesh", "camera"} <= {p["cue"] for p in data["providers"]}
 
 
 def test_missing_egl_names_the_system_libraries(taa, monkeypatch):
