@@ -10,6 +10,8 @@ import contextlib
 import errno
 import json
 import os
+import re
+import shutil
 import signal
 import sys
 import traceback
@@ -387,14 +389,19 @@ def error_sentence(error: BaseException) -> str:
     """One line for the user: what is wrong; what to do."""
     from taa_envs.errors import TaaEnvsError
 
+    if isinstance(error, shutil.Error):  # copying a folder: a list of (from, to, words), its errors' numbers in the words
+        number = re.search(r"\[Errno (\d+)\]", str(error))
+        error = OSError(int(number[1]), os.strerror(int(number[1])), str(error.args[0][0][1])) if number else error
     text = " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; run the same command again, with --scene it goes on where it was"
     if isinstance(error, TaaEnvsError) or any(c.__name__ == "TaaError" for c in type(error).__mro__):
         return text
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         where = f" at {error.filename}" if error.filename else ""
         return f"the disk is full{where}; free some space or write elsewhere (--out, --scene, TMPDIR)"
+    if isinstance(error, OSError) and error.errno == errno.EROFS:
+        return f"read-only file system at {error.filename or 'a file'}; write elsewhere (--out, --scene)"
     if isinstance(error, PermissionError):
         return f"no permission for {error.filename or 'a file'}; write elsewhere (--out, --scene) or change its mode"
     if isinstance(error, OSError) and error.filename:
