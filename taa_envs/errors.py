@@ -19,3 +19,7 @@ class UnknownAsset(TaaEnvsError, LookupError):
 
 class UnknownHand(TaaEnvsError, LookupError):
     """No hand has that name; the message lists the names there are."""
+
+
+class HandUnavailable(TaaEnvsError):
+    """A robot hand's model is not on this machine and cannot be fetched."""

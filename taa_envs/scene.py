@@ -16,6 +16,7 @@ import numpy as np
 from taa_envs.asset import Asset
 from taa_envs.errors import AssetError
 from taa_envs.hands import Controller, Hand, make_hand
+from taa_envs.hands.landmarks import SIDES, side_of
 from taa_envs.registry import CONTROL_PERIOD
 
 if TYPE_CHECKING:
@@ -226,9 +227,16 @@ def build_spec(asset: Asset, hand: Hand | None, *, touch_static: bool = False) -
         _add_touch(spec)
         hand.attach(spec)
         for geom in spec.geoms:
-            if geom.parent.name not in ("static", "moving", "world"):
+            solid = geom.contype or geom.conaffinity
+            if solid and geom.parent.name not in ("static", "moving", "world"):
                 geom.contype, geom.conaffinity = 0, MOVING_BIT | (STATIC_BIT if touch_static else 0)
     return spec
+
+
+def _side(asset: Asset) -> str:
+    """Whether a right or a left hand demonstrated."""
+    side = (asset.provenance.get("hand.side") or {}).get("value")
+    return side if side in SIDES else side_of(asset.reference.hand_joints)
 
 
 def build_scene(asset: Asset, hand: str | Hand | None = "points", *, touch_static: bool = False) -> Scene:
@@ -245,7 +253,7 @@ def build_scene(asset: Asset, hand: str | Hand | None = "points", *, touch_stati
     """
     import mujoco
 
-    made = make_hand(hand) if isinstance(hand, str) else hand
+    made = make_hand(hand, side=_side(asset)) if isinstance(hand, str) else hand
     model = build_spec(asset, made, touch_static=touch_static).compile()
     moving = model.geom_bodyid == model.body("moving").id
     static = model.geom_bodyid == model.body("static").id

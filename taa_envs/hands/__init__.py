@@ -14,7 +14,7 @@ from taa_envs.errors import UnknownHand
 if TYPE_CHECKING:
     import mujoco
 
-HANDS = ("points",)
+HANDS = ("points", "human", "shadow", "allegro", "leap")
 
 
 class Controller(Protocol):
@@ -46,14 +46,23 @@ class Hand(Protocol):
         """A controller for the compiled scene."""
 
 
-def make_hand(name: str, **kwargs: Any) -> Hand:
-    """The hand of that name.
+def make_hand(name: str, side: str = "right", **kwargs: Any) -> Hand:
+    """The hand of that name; side "right" or "left" matters to those with joints.
 
     Raises:
         UnknownHand: there is none; the message lists the names.
+        HandUnavailable: its model is not on this machine and cannot be fetched.
     """
     if name == "points":
         from taa_envs.hands.points import PointsHand
 
         return PointsHand(**kwargs)
+    if name == "human":
+        from taa_envs.hands.human import human
+
+        return human(side)
+    if name in HANDS:
+        from taa_envs.hands.menagerie import robot_hand
+
+        return robot_hand(name, side)
     raise UnknownHand(f"no hand is named {name!r}; known: {', '.join(HANDS)}")
