@@ -32,7 +32,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taa_envs.asset import Asset
-from taa_envs.hands import Hand
+from taa_envs.hands import Hand, make_hand
+from taa_envs.hands.rig import JointedController
 from taa_envs.scene import Scene, build_scene
 from taa_envs.simulation import Diverged, HandPath, Simulation, Step
 
@@ -200,6 +201,10 @@ def replay(asset: Asset, hand: str | Hand = "points", *, controls: bool = True, 
     progress = {}
     for name in CONTROLS if controls else ():
         control_scene = build_scene(asset, None) if name == "no_hand" else scene
+        if name == "mirrored_hand" and isinstance(scene.hand, JointedController):
+            # In a mirror a right hand is a left one, and only a left one can do what it does there.
+            other = "left" if scene.hand.hand.skeleton.side == "right" else "right"
+            control_scene = build_scene(asset, make_hand(scene.hand.hand.name, other), touch_static=touch_static)
         progress[name] = float(asset.progress(simulate(control_scene, control_path(scene, name)).q[-1]))
     fractions = asset.stroke_fraction(np.array(run.q_extremes))
     return ReplayResult(

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from taa_envs.hands.rig import JointedController
 from taa_envs.replay import HOLD
 from taa_envs.rows import BatchRows, hand_rows
 from taa_envs.scene import Scene, decode_touch, touch_columns
@@ -32,6 +34,36 @@ class Rollout:
     diverged: bool
 
 
+class _Row:
+    """One of many simulations, as much of ``MjData`` as a controller writes and reads."""
+
+    def __init__(self, rows: BatchRows, row: int) -> None:
+        bind = rows.batch.bind
+        self.qpos, self.qvel, self.ctrl = rows.qpos[row], rows.qvel[row], rows.ctrl[row]
+        self.mocap_pos, self.mocap_quat = bind("mocap_pos")[row], bind("mocap_quat")[row]
+        self.time = 0.0
+
+
+class _JointedRows:
+    """A hand with joints in many simulations: each is retargeted by itself, all are stepped together."""
+
+    def __init__(self, controller: JointedController, rows: BatchRows) -> None:
+        self._controller, self._rows = controller, rows
+        self._data: list[Any] = [_Row(rows, k) for k in range(rows.n)]
+
+    def targets(self, joints: np.ndarray) -> np.ndarray:
+        return joints
+
+    def place(self, ids: np.ndarray, joints: np.ndarray) -> None:
+        for k in ids:
+            self._controller.place(self._data[k], joints[k])
+
+    def control(self, target: np.ndarray) -> None:
+        for data, joints, time in zip(self._data, target, self._rows.time, strict=True):
+            data.time = float(time)
+            self._controller.control(data, joints)
+
+
 class Rollouts:
     """A scene, and room for ``n`` simulations of it.
 
@@ -44,7 +76,8 @@ class Rollouts:
     def __init__(self, scene: Scene, n: int = 24, threads: int = 0) -> None:
         self.scene, self.n = scene, n
         self._rows = BatchRows(scene, n, threads)
-        self._hand = hand_rows(scene, self._rows)
+        jointed = isinstance(scene.hand, JointedController)
+        self._hand = _JointedRows(scene.hand, self._rows) if jointed else hand_rows(scene, self._rows)
 
     def run(self, paths: Sequence[HandPath]) -> list[Rollout]:
         """Replay every path from the reference's first frame to the demonstration's end plus :data:`HOLD`."""

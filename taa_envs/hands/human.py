@@ -111,5 +111,5 @@ def human(side: str = "right") -> JointedHand:
     fingers = ("thumb", *KNUCKLES)
     skeleton = Skeleton(root="palm", side=side, palm="palm", knuckles={f: f"{f}_1" for f in fingers},
                         chain={f: (f"{f}_2", f"{f}_3") for f in fingers},
-                        tips={f: (f"{f}_3", (0.0, lengths[f], 0.0)) for f in fingers}, wrist=(0.0, 0.0, 0.0))
+                        tips={f: (f"{f}_3", (0.0, lengths[f], 0.0)) for f in fingers})
     return JointedHand("human", lambda: build_spec(side), skeleton)

@@ -28,7 +28,7 @@ def palm_frame(joints: np.ndarray, side: str) -> np.ndarray:
 
 
 def side_of(joints: np.ndarray) -> str:
-    """"right" or "left" of landmarks (T, 21, 3): the side to which its fingers curl. A flat hand passes for a right one."""
+    """"right" or "left" of landmarks (T, 21, 3), by where the fingers curl; a flat hand passes for a right one."""
     x, y = joints[:, 5] - joints[:, 17], joints[:, 9] - joints[:, 0]
     out = np.cross(x, y)
     out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)

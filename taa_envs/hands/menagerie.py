@@ -30,7 +30,6 @@ class Robot:
         prefix: of the right and the left hand's names.
         fingers: finger -> bodies of its knuckle, the two joints after it, and of its tip.
         tip, thumb_tip: (3,) m of the tip's centre in the tip's body.
-        wrist: (3,) m in the palm's body.
     """
 
     model: str
@@ -40,7 +39,6 @@ class Robot:
     fingers: dict[str, tuple[str, str, str, str]]
     tip: Offset
     thumb_tip: Offset
-    wrist: Offset
 
 
 ROBOTS = {
@@ -49,19 +47,19 @@ ROBOTS = {
         {**{f: tuple(f"{{p}}{s}{part}" for part in ("knuckle", "middle", "distal", "distal"))
             for f, s in (("index", "ff"), ("middle", "mf"), ("ring", "rf"), ("little", "lf"))},
          "thumb": ("{p}thproximal", "{p}thmiddle", "{p}thdistal", "{p}thdistal")},
-        (0.0, 0.0, 0.018), (0.0, 0.0, 0.022), (0.0, 0.0, 0.0)),
+        (0.0, 0.0, 0.018), (0.0, 0.0, 0.022)),
     "allegro": Robot(
         "wonik_allegro", "palm", "palm", ("", ""),
         {**{f: tuple(f"{s}_{part}" for part in ("base", "medial", "distal", "tip"))
             for f, s in (("index", "ff"), ("middle", "mf"), ("ring", "rf"))},
          "thumb": ("th_proximal", "th_medial", "th_distal", "th_tip")},
-        (0.0, 0.0, 0.027), (0.0, 0.0, 0.042), (0.0, 0.0, -0.095)),
+        (0.0, 0.0, 0.027), (0.0, 0.0, 0.042)),
     "leap": Robot(
         "leap_hand", "palm", "palm", ("", ""),
         {**{f: tuple(f"{s}_{part}" for part in ("bs", "md", "ds", "ds"))
             for f, s in (("index", "if"), ("middle", "mf"), ("ring", "rf"))},
          "thumb": ("th_bs", "th_px", "th_ds", "th_ds")},
-        (0.0, -0.04, 0.0145), (0.0, -0.043, -0.0145), (-0.095, -0.0224, -0.0187)),
+        (0.0, -0.04, 0.0145), (0.0, -0.043, -0.0145)),
 }  # fmt: skip
 
 
@@ -108,5 +106,5 @@ def robot_hand(name: str, side: str = "right") -> JointedHand:
     skeleton = Skeleton(
         root=robot.root.format(p=prefix), side=side, palm=robot.palm.format(p=prefix),
         knuckles={f: b[0] for f, b in bodies.items()}, chain={f: (b[1], b[2]) for f, b in bodies.items()},
-        tips={f: (b[3], robot.thumb_tip if f == "thumb" else robot.tip) for f, b in bodies.items()}, wrist=robot.wrist)
+        tips={f: (b[3], robot.thumb_tip if f == "thumb" else robot.tip) for f, b in bodies.items()})
     return JointedHand(name, load, skeleton)

@@ -1,7 +1,7 @@
 """A demonstrated hand on another hand's joints: differential inverse kinematics with mink.
 
-Tasks, in order of weight: the finger tips are where the demonstration has them (that is where it touches), the palm looks
-and lies as the demonstrated palm does, the joints stay near their middle. One step is one quadratic program under
+Tasks, in order of weight: the finger tips are where the demonstration has them (that is where it touches), the palm
+looks and lies as the demonstrated palm does, the joints stay near their middle. One step is one quadratic program under
 joint and velocity limits; as a linear step can still leave a limit, both are enforced again after integration.
 """
 
@@ -57,7 +57,7 @@ class Retargeting:
         self._speed_limit = mink.VelocityLimit(model, {name: JOINT_SPEED for name in names})
 
     def start(self, joints: np.ndarray, rounds: int = 60) -> np.ndarray:
-        """(7 + n,) configuration for landmarks (21, 3) m from nothing: palm in place, joints in the middle, then solved."""
+        """(7 + n,) configuration for landmarks (21, 3) m: palm in place, joints near their middle, then solved."""
         import mink
         import mujoco
 

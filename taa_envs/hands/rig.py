@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 PREFIX = "hand_"
 PERIOD = 5  # simulation steps between two retargetings
 BASE_RATE = 80.0  # rad/s, natural frequency of the base's servos
+METACARPAL = 0.087  # m from the middle knuckle to the wrist, which a robot has elsewhere
 BASE_FORCE, BASE_TORQUE = 60.0, 6.0  # N and N m: what an arm gives; the force is that of the hand of points
 
 
@@ -35,7 +36,6 @@ class Skeleton:
         knuckles: finger -> body at its knuckle.
         chain: finger -> bodies of its two joints after the knuckle.
         tips: finger -> (body, offset (3,) m in it) of the tip's centre.
-        wrist: (3,) m of the wrist in the palm's body.
     """
 
     root: str
@@ -44,7 +44,6 @@ class Skeleton:
     knuckles: dict[str, str]
     chain: dict[str, tuple[str, str]]
     tips: dict[str, tuple[str, tuple[float, float, float]]]
-    wrist: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -96,12 +95,12 @@ class JointedHand:
         palm = model.body(s.palm).id
         at = {f: (data.xpos[model.body(b).id] - data.xpos[palm]) @ data.xmat[palm].reshape(3, 3)
               for f, b in s.knuckles.items()}
-        others = [f for f in ("little", "ring") if f in at]
-        y = at["middle"] - np.array(s.wrist)
-        y /= np.linalg.norm(y)
-        x = at["index"] - at[others[0]]
-        x = (x - (x @ y) * y) * (1 if s.side == "right" else -1)
+        last = at["little"] if "little" in at else at["ring"]
+        x = (at["index"] - last) * (1 if s.side == "right" else -1)
         x /= np.linalg.norm(x)
+        y = at["middle"] - model.body(s.palm).ipos  # fingers grow away from the palm's mass
+        y -= (y @ x) * x
+        y /= np.linalg.norm(y)
         return np.stack([x, y, np.cross(x, y)], axis=1), at["middle"]
 
     def attach(self, spec: mujoco.MjSpec) -> None:
@@ -162,7 +161,7 @@ class JointedController:
         self._range = (np.where(alone.actuator_ctrllimited, alone.actuator_ctrlrange[:, 0], -np.inf),
                        np.where(alone.actuator_ctrllimited, alone.actuator_ctrlrange[:, 1], np.inf))
         body = lambda name: model.body(PREFIX + name).id  # noqa: E731
-        self._wrist = (body(s.palm), np.array(s.wrist))
+        self._palm = model.site(f"{PREFIX}palm").id
         self._sites = {f: model.site(f"{PREFIX}tip_{f}").id for f in s.tips}
         self._chains = {f: [body(s.knuckles[f]), *(body(b) for b in s.chain[f])] for f in s.tips}
 
@@ -196,9 +195,8 @@ class JointedController:
 
     def landmarks(self, data: mujoco.MjData) -> np.ndarray:
         """(21, 3) m where the landmarks are; a finger that the hand has not is where its neighbour is."""
-        palm, wrist = self._wrist
         out = np.empty((21, 3))
-        out[0] = data.xpos[palm] + data.xmat[palm].reshape(3, 3) @ wrist
+        out[0] = data.site_xpos[self._palm] - METACARPAL * data.site_xmat[self._palm].reshape(3, 3)[:, 1]
         for finger, joints in FINGERS.items():
             name = finger if finger in self._sites else "ring"
             for joint, body in zip(joints, self._chains[name], strict=False):

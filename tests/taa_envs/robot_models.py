@@ -7,6 +7,7 @@ E3M5, Allegro V3, LEAP); capsules and boxes in place of meshes, which carry no k
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 
 def _body(name: str, pos: str, inner: str, quat: str = "1 0 0 0") -> str:
@@ -43,7 +44,8 @@ def shadow() -> str:
     thumb_distal = _body("rh_thdistal", "0 0 0.032",
                          '<inertial pos="0 0 0.0145" mass="0.017" diaginertia="2.4e-6 2.3e-6 1e-6"/>'
                          + _joint("rh_THJ1", "1 0 0", -0.261799, 1.5708) + _capsule(0.0095, 0.013, 0.014), "1 0 0 -1")
-    thumb_middle = _body("rh_thmiddle", "0 0 0", '<inertial pos="0 0 0.016" mass="0.02" diaginertia="5e-6 5e-6 1.2e-6"/>'
+    thumb_middle = _body("rh_thmiddle", "0 0 0",
+                         '<inertial pos="0 0 0.016" mass="0.02" diaginertia="5e-6 5e-6 1.2e-6"/>'
                          + _joint("rh_THJ2", "0 -1 0", -0.698132, 0.698132) + _capsule(0.009, 0.009, 0.012)
                          + thumb_distal)
     hub = _body("rh_thhub", "0 0 0.038", '<inertial pos="0 0 0" mass="0.005" diaginertia="1e-6 1e-6 3e-7"/>'
@@ -105,8 +107,8 @@ def allegro() -> str:
                        + box("0.0098 0.01375 0.0192", "0 0 0.0192") + distal)
         proximal = _body(f"{s}_proximal", "0 0 0.0164", _joint(f"{s}j1", "0 1 0", -0.196, 1.61)
                          + box("0.0098 0.01375 0.027", "0 0 0.027") + medial)
-        return _body(f"{s}_base", pos, _joint(f"{s}j0", "0 0 1", -0.47, 0.47) + box("0.0098 0.01375 0.0082", "0 0 0.0082")
-                     + proximal, quat)
+        return _body(f"{s}_base", pos, _joint(f"{s}j0", "0 0 1", -0.47, 0.47)
+                     + box("0.0098 0.01375 0.0082", "0 0 0.0082") + proximal, quat)
 
     tip = _body("th_tip", "0 0 0", _capsule(0.012, 0.008, 0.035))
     distal = _body("th_distal", "0 0 0.0514", _joint("thj3", "0 1 0", -0.162, 1.719)
@@ -179,9 +181,22 @@ def leap() -> str:
 FOLDERS = {"shadow": ("shadow_hand", shadow), "allegro": ("wonik_allegro", allegro), "leap": ("leap_hand", leap)}
 
 
+def mirrored(text: str) -> str:
+    """The left hand of a right one: every place, turn and joint axis reflected in x = 0."""
+    root = ElementTree.fromstring(text)
+    flips = {"pos": (-1, 1, 1), "fromto": (-1, 1, 1, -1, 1, 1), "axis": (1, -1, -1), "quat": (1, 1, -1, -1)}
+    for element in root.iter():
+        for key, signs in flips.items():
+            if key in element.attrib:
+                numbers = [s * float(v) for s, v in zip(signs, element.attrib[key].split(), strict=True)]
+                element.set(key, " ".join(map(str, numbers)))
+    return ElementTree.tostring(root, encoding="unicode").replace("rh_", "lh_")
+
+
 def write_models(root: Path) -> Path:
-    """A folder laid out as the collection (``MENAGERIE_ROOT``) with the three right hands."""
+    """A folder laid out as the collection (``MENAGERIE_ROOT``) with both hands of the three robots."""
     for folder, make in FOLDERS.values():
         (root / folder).mkdir(parents=True, exist_ok=True)
         (root / folder / "right_hand.xml").write_text(make(), encoding="utf-8")
+        (root / folder / "left_hand.xml").write_text(mirrored(make()), encoding="utf-8")
     return root
