@@ -26,7 +26,7 @@ from taa_envs.asset import Asset
 from taa_envs.registry import CONTROL_PERIOD, get_asset, max_episode_steps
 from taa_envs.rows import SingleRows
 from taa_envs.scene import build_scene
-from taa_envs.task import Task
+from taa_envs.single import SingleTask
 
 
 class ArticulationEnvironment(dm_env.Environment):
@@ -40,7 +40,7 @@ class ArticulationEnvironment(dm_env.Environment):
                  seed: int | None, time_limit: float | None, touch_static: bool) -> None:
         scene = build_scene(asset, hand, touch_static=touch_static)
         self._physics = Physics.from_model(MjModel(scene.model))
-        self.task = Task(scene, SingleRows(scene, self._physics.data.ptr), action=action, reward=reward)
+        self.task = SingleTask(scene, SingleRows(scene, self._physics.data.ptr), action=action, reward=reward)
         if self.task.goal:
             raise ValueError("dm_control environments are not goal-conditioned; use reward='dense' or 'sparse'")
         self._randomize, self._generator = randomize, seeding.np_random(seed)[0]
@@ -71,10 +71,10 @@ class ArticulationEnvironment(dm_env.Environment):
         """One step; starts an episode where none runs. An episode that the time limit ends has discount 1."""
         if self._over:
             return self.reset()
-        rewards, _ = self.task.step(np.asarray(action, np.float32)[None])
+        reward, _, info = self.task.step_one(action)
         self._steps += 1
-        reward, seen = float(rewards[0]), self._observation()
-        if self.task.success()[0] or self.task.diverged[0]:
+        seen = self._observation()
+        if info["success_now"] or info["diverged"]:
             self._over = True
             return dm_env.termination(reward, seen)
         if self._steps >= self._limit:
@@ -83,7 +83,8 @@ class ArticulationEnvironment(dm_env.Environment):
         return dm_env.transition(reward, seen)
 
     def _observation(self) -> OrderedDict[str, np.ndarray]:
-        return OrderedDict((name, value[0]) for name, value in self.task.observation().items())
+        parts = self.task.parts_of(self.task.observe_one()[None])
+        return OrderedDict((name, value[0]) for name, value in parts.items())
 
     def observation_spec(self) -> OrderedDict[str, specs.BoundedArray]:
         return OrderedDict((name, specs.BoundedArray((size,), np.float32, -10.0, 10.0, name))

@@ -17,9 +17,8 @@ from taa_envs.registry import CONTROL_PERIOD, get_asset
 from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, goal_reward
 from taa_envs.rows import SingleRows
 from taa_envs.scene import build_scene
-from taa_envs.task import OBSERVATIONS, RESIDUALS, Task, apply_residual
-
-ACTIONS = RESIDUALS  # numbers in an action of the default kind
+from taa_envs.single import SingleTask
+from taa_envs.task import OBSERVATIONS, Task, apply_residual
 
 
 def spaces_of(task: Task, observation: str) -> tuple[spaces.Space, spaces.Box]:
@@ -45,12 +44,12 @@ def spaces_of(task: Task, observation: str) -> tuple[spaces.Space, spaces.Box]:
     return flat, spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
 
 
-def observe(task: Task, observation: str) -> np.ndarray | dict[str, np.ndarray]:
-    """(n, ...) observations in the form of :func:`spaces_of`; new arrays."""
-    parts = task.observation()
+def observe(task: Task, observation: str, flat: np.ndarray | None = None) -> np.ndarray | dict[str, np.ndarray]:
+    """(n, ...) observations in the form of :func:`spaces_of`; new arrays. flat: of :meth:`Task.observation`."""
+    if flat is None:
+        flat = task.observation()
     if observation == "dict":
-        return parts
-    flat = np.concatenate(list(parts.values()), axis=1)
+        return task.parts_of(flat)
     if not task.goal:
         return flat
     return {"observation": flat, "achieved_goal": task.achieved(),
@@ -70,39 +69,47 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     is the hand, whose position actuators the action aims.
 
     ## Actions
-    ``action="residual"`` (default): ``Box(-1, 1, (7,), float32)``, added to the reference hand at the current time. The
-    zero action is the open-loop replay of the demonstration.
+    ``action="residual"`` (default): ``Box(-1, 1, (8,), float32)``, corrections of the reference hand and the pace at
+    which it is played. The zero action is the open-loop replay of the demonstration.
 
     | index | what | of an action of 1 |
     | --- | --- | --- |
-    | 0-2 | translation along x, y, z of the asset frame | 0.03 m |
+    | 0-2 | translation along x, y, z of the asset frame | ``task.translation``, see below |
     | 3-5 | rotation about x, y, z through the palm's centre | 0.3 rad |
     | 6 | closing: finger joints move towards the finger tips' mean (negative: open) | 0.5 of the way at the tips |
+    | 7 | pace: the reference's clock runs at 1 + 1.5 a (-1: backwards at half its speed) | 2.5 s a second |
+
+    ``task.translation`` is three standard deviations of where hand and part meet, by the asset's own account, within
+    0.03 and 0.15 m. Corrections follow the action by 0.2 of their range a step at most.
 
     ``action="absolute"``: ``Box(-1, 1, (63,), float32)``, where the 21 landmarks are to be, relative to the
     demonstration's first frame, in units of ``reach`` (1.25 times the farthest the demonstrated hand goes along an
     axis, at least 0.1 m). The zero action holds the hand where the demonstration began. Targets move at most at 2 m/s
     (or 1.5 times the demonstration's fastest). :meth:`reference_action` is the action that follows the demonstration.
 
+    In a step of 0.02 s the actuators' targets move evenly from where they were to where the action puts them.
+
     ## Observations
-    ``observation="flat"`` (default): ``Box(-10, 10, (153,), float32)`` (209 with absolute actions), clipped;
+    ``observation="flat"`` (default): ``Box(-10, 10, (170,), float32)`` (225 with absolute actions), clipped;
     ``observation="dict"``: the same parts as a Dict of boxes.
 
     | part | index | what |
     | --- | --- | --- |
     | joint | 0 | fraction of the demonstrated stroke, not clipped to [0, 1] |
     | | 1 | its rate in strokes per demonstration |
-    | hand | 2-64 | 21 landmarks where they are, from the object's centre, in units of its size |
-    | | 65-67 | their mean velocity, m/s |
-    | contact | 68 | 1 if the hand pushed on the moving link in the last step |
-    | | 69-71 | mean contact force of that step on the link, asset frame, in units of 10 N |
-    | | 72 | its moment about the joint, in 10 N at the object's size (10 N along a slide) |
-    | reference | 73 | time as a fraction of the demonstration, at most 1 |
-    | | 74 | the demonstration's stroke fraction now |
-    | | 75-137 | 21 landmarks, from where they are to the reference, in units of 0.02 m |
-    | | 138-139 | the demonstration's stroke fraction in 0.1 and in 0.3 s |
-    | | 140-145 | the demonstrated hand's way from now to then, in units of the object's size |
-    | action | 146- | the last action |
+    | | 2 | how far it is ahead of the demonstration, in fifths of the stroke |
+    | hand | 3-65 | 21 landmarks where they are, from the object's centre, in units of its size |
+    | | 66-68 | their mean velocity, m/s |
+    | contact | 69 | 1 if the hand pushed on the moving link in the last step |
+    | | 70-72 | mean contact force of that step on the link (its impulse a second), asset frame, in units of 10 N |
+    | | 73 | its moment about the joint, in 10 N at the object's size (10 N along a slide) |
+    | reference | 74 | time as a fraction of the demonstration, at most 1 |
+    | | 75 | the demonstration's stroke fraction now |
+    | | 76-77 | the demonstration's stroke fraction in 0.1 and in 0.3 s |
+    | | 78-83 | the demonstrated hand's way from now to then, in units of the object's size |
+    | | 84-146 | 21 landmarks, from where they are to the reference, in units of 0.02 m |
+    | grip | 147-161 | 5 finger tips in the link's frame, from where the demonstration had them, in units of 0.02 m |
+    | action | 162- | the corrections as applied and the last pace; the last absolute action |
 
     ## Rewards
     ``reward="dense"`` (default), ``"sparse"`` (1 on success) or a dict of scales of the terms in
@@ -112,8 +119,9 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
 
     ## Episode
     Starts at the demonstration's first frame. Terminates on success: ``joint_progress >= 0.95``, of which at least 0.8
-    was made while the hand's contact did work on the joint. Truncated (by ``gym.make``'s time limit) after one and a
-    half times the demonstration. Should the simulation diverge the episode terminates and ``info["diverged"]`` is True.
+    was made in steps in which the hand's contact impulse did work on the joint. Truncated (by ``gym.make``'s time
+    limit) after one and a half times the demonstration. Should the simulation diverge the episode terminates and
+    ``info["diverged"]`` is True.
 
     ``reset(options=...)``:
 
@@ -163,7 +171,7 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         if scene.hand is None:
             raise ValueError("the environment needs a hand; name one")
         self._rows = SingleRows(scene)
-        self.task = Task(scene, self._rows, action=action, reward=reward)
+        self.task = SingleTask(scene, self._rows, action=action, reward=reward)
         self.observation_space, self.action_space = spaces_of(self.task, observation)
         self._observed, self._randomize = observation, randomize
         if self.task.goal:  # elsewhere it would make Stable-Baselines3 take the environment for a goal-conditioned one
@@ -200,16 +208,17 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         """
         super().reset(seed=seed)
         made = self.task.begin(0, self.np_random, options, self._randomize)
-        info = self._info({})
+        info: dict[str, Any] = {name: value[0].item() for name, value in self.task.info().items()}
+        info["reward_terms"] = {}
         if made:
             info["randomized"] = made
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See the class."""
-        reward, terms = self.task.step(np.asarray(action, np.float32)[None])
-        info = self._info(terms)
-        return self._observation(), float(reward[0]), info["success_now"] or info["diverged"], False, info
+        reward, terms, info = self.task.step_one(action)
+        info["reward_terms"] = terms
+        return self._observation(), reward, info["success_now"] or info["diverged"], False, info
 
     def reference_action(self) -> np.ndarray:
         """The action that follows the demonstrated hand in the next step."""
@@ -224,14 +233,11 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
         self.task.restore(0, state)
         self.np_random.bit_generator.state = state["generator"]
 
-    def _info(self, terms: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        info: dict[str, Any] = {name: value[0].item() for name, value in self.task.info().items()}
-        info["reward_terms"] = {name: float(value[0]) for name, value in terms.items()}
-        return info
-
     def _observation(self) -> Any:
-        made = observe(self.task, self._observed)
-        return {name: value[0] for name, value in made.items()} if isinstance(made, dict) else made[0]
+        flat = self.task.observe_one()
+        if self._observed == "flat" and not self.task.goal:
+            return flat
+        return {name: value[0] for name, value in observe(self.task, self._observed, flat[None]).items()}
 
     def render(self) -> np.ndarray | None:
         """(height, width, 3) uint8, or (height, width) float32 m for "depth_array"; None without a render mode."""
@@ -253,5 +259,5 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
             self._renderer = None
 
 
-__all__ = ["ACTIONS", "DRIVEN_SHARE", "SUCCESS_PROGRESS", "ArticulationEnv", "apply_residual", "compute_reward",
+__all__ = ["DRIVEN_SHARE", "SUCCESS_PROGRESS", "ArticulationEnv", "apply_residual", "compute_reward",
            "observe", "spaces_of"]

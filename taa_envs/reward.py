@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import tanh
 
 import numpy as np
 
@@ -79,6 +80,25 @@ def reward_terms(step: RewardInputs, scales: Mapping[str, float]) -> dict[str, n
             raw = -np.minimum(np.maximum(over, 0.0), 1.0)
         else:
             raw = np.asarray(step.success, float)
+        out[name] = scale * raw
+    return out
+
+
+def scalar_terms(driven: float, moved: float, contact: bool, distance: float, penetration: float, action: list[float],
+                 previous_action: list[float], success: bool, scales: Mapping[str, float]) -> dict[str, float]:
+    """:func:`reward_terms` of one step, in Python's numbers; inputs as in :class:`RewardInputs`."""
+    out: dict[str, float] = {}
+    for name, scale in scales.items():
+        if name == "progress":
+            raw = driven + min(moved, 0.0)
+        elif name == "reach":
+            raw = 0.0 if contact else -tanh(distance / REACH_SCALE)
+        elif name == "action_rate":
+            raw = -sum([(a - b) * (a - b) for a, b in zip(action, previous_action, strict=True)]) / len(action)
+        elif name == "penetration":
+            raw = -min(max((penetration - FREE_PENETRATION) / FREE_PENETRATION, 0.0), 1.0)
+        else:
+            raw = float(success)
         out[name] = scale * raw
     return out
 

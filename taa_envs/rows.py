@@ -13,10 +13,12 @@ import numpy as np
 
 from taa_envs.hands import Controller
 from taa_envs.hands.points import PointsController
-from taa_envs.scene import Scene
+from taa_envs.scene import CONTROL_PERIOD, SUBSTEPS, Scene, touch_history
 
 if TYPE_CHECKING:
     import mujoco
+
+_MEAN = np.full(21, 1 / 21)
 
 # Model fields that an episode may change, see taa_envs.randomize.
 MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping", "dof_frictionloss")
@@ -24,14 +26,18 @@ MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping
 
 class Rows(Protocol):
     """``n`` simulations. Arrays are live: ``qpos`` (n, nq), ``qvel`` (n, nv), ``act`` (n, na), ``ctrl`` (n, nu),
-    ``time`` (n,), ``sensordata`` (n, nsensordata; of the state before the last step), ``history`` (n, nhistory)."""
+    ``time`` (n,); of the state before the last step ``sensordata`` (n, nsensordata), ``link_pos`` (n, 3) and
+    ``link_mat`` (n, 3, 3) of the moving link; ``touches`` (n, SUBSTEPS, 10), what :func:`taa_envs.scene.touch_history`
+    finds."""
 
     n: int
     qpos: np.ndarray
     qvel: np.ndarray
     act: np.ndarray
-    history: np.ndarray
     ctrl: np.ndarray
+    link_pos: np.ndarray
+    link_mat: np.ndarray
+    touches: np.ndarray
     sensordata: np.ndarray
 
     @property
@@ -50,14 +56,23 @@ class Rows(Protocol):
     def forward(self, ids: np.ndarray) -> None:
         """Compute what follows from states that were written."""
 
-    def step(self, ids: np.ndarray | None) -> None:
-        """One time step of those simulations, None for all."""
+    def step(self, ids: np.ndarray | None, count: int = 1) -> None:
+        """So many time steps of those simulations, None for all."""
 
     def snapshot(self, row: int) -> np.ndarray:
         """Full state; a copy."""
 
     def restore(self, row: int, state: np.ndarray) -> None:
         """Take a state of :meth:`snapshot`."""
+
+
+def _touches(scene: Scene, history: np.ndarray) -> np.ndarray:
+    """(n, SUBSTEPS, 10) view of histories (n, nhistory); (n, 0, 10) in a scene without a hand."""
+    if scene.hand is None:
+        return np.empty((len(history), 0, 10))
+    out = history[:, touch_history(scene)].reshape(len(history), SUBSTEPS, 10)
+    assert np.shares_memory(out, history)
+    return out
 
 
 class SingleRows:
@@ -71,8 +86,10 @@ class SingleRows:
         self._mujoco, self.model = mujoco, scene.model
         self.data = mujoco.MjData(scene.model) if data is None else data
         self.qpos, self.qvel = self.data.qpos[None], self.data.qvel[None]
-        self.act, self.history = self.data.act[None], self.data.history[None]
-        self.ctrl, self.sensordata = self.data.ctrl[None], self.data.sensordata[None]
+        self.act, self.ctrl = self.data.act[None], self.data.ctrl[None]
+        self.sensordata, body = self.data.sensordata[None], scene.model.body("moving").id
+        self.link_pos, self.link_mat = self.data.xpos[None, body], self.data.xmat[None, body].reshape(1, 3, 3)
+        self.touches = _touches(scene, self.data.history[None])
         self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
 
     @property
@@ -91,8 +108,8 @@ class SingleRows:
     def forward(self, ids: np.ndarray) -> None:
         self._mujoco.mj_forward(self.model, self.data)
 
-    def step(self, ids: np.ndarray | None) -> None:
-        self._mujoco.mj_step(self.model, self.data)
+    def step(self, ids: np.ndarray | None, count: int = 1) -> None:
+        self._mujoco.mj_step(self.model, self.data, count)
 
     def snapshot(self, row: int) -> np.ndarray:
         state = np.empty(self._mujoco.mj_stateSize(self.model, self._spec))
@@ -116,8 +133,11 @@ class BatchRows:
         self.n, self._none = n, int(mujoco.mjtStage.mjSTAGE_NONE)
         self.batch = Batch(scene.model, n, threads)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self.act, self.history = self.batch.bind("act"), self.batch.bind("history")
-        self.ctrl, self.sensordata = self.batch.bind("ctrl"), self.batch.bind("sensordata")
+        self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
+        self.sensordata, body = self.batch.bind("sensordata"), scene.model.body("moving").id
+        self.link_pos = self.batch.bind("xpos")[:, body]
+        self.link_mat = self.batch.bind("xmat")[:, body].reshape(n, 3, 3)
+        self.touches = _touches(scene, self.batch.bind("history"))
         self._time = self.batch.bind("time")
         self._model: dict[str, np.ndarray] = {}
 
@@ -139,8 +159,8 @@ class BatchRows:
     def forward(self, ids: np.ndarray) -> None:
         self.batch.forward(ids)
 
-    def step(self, ids: np.ndarray | None) -> None:
-        self.batch.step(ids)
+    def step(self, ids: np.ndarray | None, count: int = 1) -> None:
+        self.batch.step(ids, nstep=count)
 
     def snapshot(self, row: int) -> np.ndarray:
         return self.batch.state[row].copy()
@@ -150,10 +170,14 @@ class BatchRows:
 
 
 class PointsRows:
-    """The hand of spheres (:mod:`taa_envs.hands.points`) in every simulation at once."""
+    """The hand of spheres (:mod:`taa_envs.hands.points`) in every simulation at once.
+
+    Attributes:
+        weights: (S, 21), targets are ``weights @ landmarks``; the first 21 are the landmarks.
+    """
 
     def __init__(self, controller: PointsController, rows: Rows) -> None:
-        self.weights, self.hand = controller.weights, controller.hand
+        self.weights, self.hand, self._rows = controller.weights, controller.hand, rows
         count, self._damping = len(self.weights), controller.hand.damping
 
         def view(array: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -166,6 +190,8 @@ class PointsRows:
 
         self._here, self._speed = view(rows.qpos, controller.qpos), view(rows.qvel, controller.dof)
         self._velocity, self._target = view(rows.ctrl, controller.act), view(rows.act, controller.target)
+        self._pull, self._drag = np.empty((count, 3)), np.empty((count, 3))
+        self._flat = self._pull.reshape(-1)
 
     def targets(self, joints: np.ndarray) -> np.ndarray:
         """(..., S, 3) sphere targets of landmarks (..., 21, 3), m."""
@@ -177,36 +203,73 @@ class PointsRows:
         self._speed[ids] = self._velocity[ids] = 0.0
 
     def control(self, target: np.ndarray) -> None:
-        """Aim at targets (n, S, 3) m within the limits of each sphere and of the whole hand."""
-        hand, here, limit = self.hand, self._here, self.hand.sphere_force
-        drag = self._damping * self._speed
-        pull = target - here
-        pull *= hand.stiffness
+        """Aim at targets (n, S, 3) m within the limits of each sphere and of the whole hand, for one substep."""
+        self._target[:] = self._within(target, 0.0)
+        self._velocity[:] = 0.0
+
+    def advance(self, before: np.ndarray, target: np.ndarray, ids: np.ndarray | None) -> None:
+        """One environment step, in which the targets move evenly to targets (n, S, 3) m; before: the last ones.
+
+        The whole hand's limit holds for the forces at the step's end as they can be foreseen, each sphere going on as
+        fast as it goes: where it binds, the targets move to where the hand just keeps it.
+        """
+        self._velocity[:] = (self._within(target, CONTROL_PERIOD) - self._target) * (1 / CONTROL_PERIOD)
+        self._rows.step(ids, SUBSTEPS)
+
+    def _within(self, target: np.ndarray, ahead: float) -> np.ndarray:
+        """Targets (n, S, 3), drawn in where the hand's forces would add up to too much after so many s."""
+        hand, limit = self.hand, self.hand.sphere_force
+        drag = (hand.stiffness * ahead + self._damping) * self._speed
+        pull = (target - self._here) * hand.stiffness
         pull -= drag
         np.maximum(np.minimum(pull, limit, out=pull), -limit, out=pull)
         square = pull * pull
         # Sums written out: their rounding must not depend on how many simulations there are.
         total = np.sqrt(square[..., 0] + square[..., 1] + square[..., 2]).sum(-1)
-        if total.max() > hand.total_force:
-            share = (hand.total_force / np.maximum(total, hand.total_force))[:, None, None]
-            target = np.where(share < 1.0, here + (pull * share + drag) / hand.stiffness, target)
-        self._target[:] = target
-        self._velocity[:] = 0.0
+        if total.max() <= hand.total_force:
+            return target
+        share = (hand.total_force / np.maximum(total, hand.total_force))[:, None, None]
+        return np.where(share < 1.0, self._here + (pull * share + drag) / hand.stiffness, target)
+
+    def advance_one(self, before: np.ndarray, target: np.ndarray) -> None:
+        """:meth:`advance` of the only simulation, targets (S, 3), with less around the arithmetic."""
+        hand, pull, drag = self.hand, self._pull, self._drag
+        np.subtract(target, self._here[0], pull)
+        np.multiply(pull, hand.stiffness, pull)
+        np.multiply(self._speed[0], hand.stiffness * CONTROL_PERIOD + self._damping, drag)
+        np.subtract(pull, drag, pull)
+        flat = self._flat
+        # The sum of S lengths is at most sqrt(S) times the root of the sum of their squares.
+        if len(pull) * float(flat @ flat) > hand.total_force**2:
+            np.minimum(pull, hand.sphere_force, out=pull)
+            np.maximum(pull, -hand.sphere_force, out=pull)
+            square = pull * pull
+            total = float(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]).sum())
+            if total > hand.total_force:
+                np.multiply(pull, hand.total_force / total, pull)
+                np.add(pull, drag, pull)
+                np.divide(pull, hand.stiffness, pull)
+                target = np.add(self._here[0], pull, pull)
+        velocity = self._velocity[0]
+        np.subtract(target, self._target[0], velocity)
+        np.multiply(velocity, 1 / CONTROL_PERIOD, velocity)
+        self._rows.step(None, SUBSTEPS)
 
     def landmarks(self) -> np.ndarray:
-        """(n, 21, 3) m; a copy."""
-        return self._here[:, :21].copy()
+        """(n, 21, 3) m; a view of the states."""
+        return self._here[:, :21]
 
     def velocity(self) -> np.ndarray:
         """(n, 3) m/s, mean of the landmarks'."""
-        return self._speed[:, :21].mean(1)
+        return _MEAN @ self._speed[:, :21]
 
 
 class ControllerRows:
-    """Any other hand, one simulation only, through its :class:`taa_envs.hands.Controller`."""
+    """Any other hand, one simulation only, through its :class:`taa_envs.hands.Controller`; targets are landmarks."""
 
     def __init__(self, controller: Controller, rows: SingleRows) -> None:
-        self._controller, self._data = controller, rows.data
+        self.weights = np.eye(21)
+        self._controller, self._rows, self._data = controller, rows, rows.data
         self._velocity = np.zeros((1, 3))
 
     def targets(self, joints: np.ndarray) -> np.ndarray:
@@ -217,6 +280,16 @@ class ControllerRows:
 
     def control(self, target: np.ndarray) -> None:
         self._controller.control(self._data, target[0])
+
+    def advance(self, before: np.ndarray, target: np.ndarray, ids: np.ndarray | None) -> None:
+        """One environment step, in which the landmarks aimed at move evenly from one (1, 21, 3) m to another."""
+        self.advance_one(before[0], target[0])
+
+    def advance_one(self, before: np.ndarray, target: np.ndarray) -> None:
+        way = target - before
+        for k in range(SUBSTEPS):
+            self._controller.control(self._data, before + (k / SUBSTEPS) * way)
+            self._rows.step(None)
 
     def landmarks(self) -> np.ndarray:
         return self._controller.landmarks(self._data)[None]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from taa_envs.asset import Asset
@@ -34,27 +37,36 @@ def score_joint_log(asset: Asset, time: np.ndarray, q: np.ndarray) -> dict[str, 
             "duration": float(time[-1] - time[0])}
 
 
-def score_actions(asset: Asset, actions: np.ndarray, hand: str = "points") -> dict[str, float]:
-    """Scores of an open-loop action sequence, played in ``TAA/<id>`` from its unperturbed start.
+def score_actions(asset: Asset, actions: np.ndarray, hand: str = "points", *, seed: int = 0,
+                  options: Mapping[str, Any] | None = None) -> dict[str, float]:
+    """Scores of an open-loop action sequence, played in ``TAA/<id>``.
 
     Args:
-        actions: (N, 7), one row an environment step, see :class:`taa_envs.env.ArticulationEnv`.
+        actions: (N, 8) residual or (N, 63) absolute actions, one row an environment step, see
+            :class:`taa_envs.env.ArticulationEnv`; (N, 7) are residual ones at the demonstration's own pace.
+        seed, options: of the reset; the default is the unperturbed start.
 
     Returns:
         joint_progress, final_q_error, max_progress, contact_fraction, wrong_way, duration (s), is_success.
 
     Raises:
-        ValueError: actions are not (N, 7) finite numbers.
+        ValueError: actions are not such finite numbers.
     """
-    from taa_envs.env import ACTIONS, ArticulationEnv
+    from taa_envs.env import ArticulationEnv
+    from taa_envs.motion import CORRECTIONS, RESIDUALS
+    from taa_envs.task import ABSOLUTES
 
-    env = ArticulationEnv(asset, hand=hand)
     actions = np.asarray(actions, np.float32)
-    if actions.ndim != 2 or actions.shape[1] != ACTIONS or not np.isfinite(actions).all():
-        raise ValueError(f"actions must be (N, {ACTIONS}) finite numbers, have shape {actions.shape}")
-    _, info = env.reset(seed=0)
+    if actions.ndim != 2 or actions.shape[1] not in (CORRECTIONS, RESIDUALS, ABSOLUTES) \
+            or not np.isfinite(actions).all():
+        raise ValueError(f"actions must be (N, {RESIDUALS}) or (N, {ABSOLUTES}) finite numbers, have shape "
+                         f"{actions.shape}")
+    if actions.shape[1] == CORRECTIONS:
+        actions = np.pad(actions, ((0, 0), (0, 1)))
+    env = ArticulationEnv(asset, hand=hand, action="absolute" if actions.shape[1] == ABSOLUTES else "residual")
+    _, info = env.reset(seed=seed, options=dict(options or {}))
     q = [env.q]
-    for action in np.clip(actions, -1, 1):
+    for action in actions:
         _, _, terminated, _, info = env.step(action)
         q.append(env.q)
         if terminated:

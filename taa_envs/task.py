@@ -1,8 +1,7 @@
 """The task itself, for any number of simulations at once: actions, observations, success, rewards.
 
-:class:`taa_envs.env.ArticulationEnv` runs it on one simulation,
-:class:`taa_envs.vector.BatchedArticulationEnv` on many.
-Every array has a leading axis of simulations, n.
+:class:`taa_envs.vector.BatchedArticulationEnv` runs it on many simulations, :class:`taa_envs.env.ArticulationEnv` its
+faster twin for one (:mod:`taa_envs.single`). Every array has a leading axis of simulations, n.
 """
 
 from __future__ import annotations
@@ -13,57 +12,28 @@ from typing import Any
 import numpy as np
 
 from taa_envs import randomize
+from taa_envs.motion import (
+    CORRECTIONS,
+    PACE,
+    RESIDUALS,
+    SLEW,
+    TIPS,
+    Layout,
+    Motion,
+    apply_residual,
+    residual_translation,
+)
 from taa_envs.registry import CONTROL_PERIOD
 from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, RewardInputs, goal_reward, reward_scales, reward_terms
 from taa_envs.rows import MODEL_FIELDS, Rows, hand_rows
-from taa_envs.scene import SUBSTEPS, TIMESTEP, Scene, decode_touch, touch_columns
+from taa_envs.scene import SUBSTEPS, TIMESTEP, Scene, touch_columns
 
-TRANSLATION, ROTATION, CLOSURE = 0.03, 0.3, 0.5  # m, rad, share of the way: residuals of an action of 1
-RESIDUALS, ABSOLUTES = 7, 63
+ABSOLUTES = 63
 HAND_SPEED = 2.0  # m/s, of an absolute target, or 1.5 times the demonstration's fastest where that is faster
-PALM = (0, 5, 9, 13, 17)
-TIPS = (4, 8, 12, 16, 20)
-# How far along its finger each landmark is: closing moves tips all the way, knuckles not at all.
-CURL = np.array([0, 0, 1, 2, 3] + [0, 1, 2, 3] * 4) / 3.0
-PREVIEW = (0.1, 0.3)  # s ahead
-ERROR_SCALE, FORCE_SCALE = 0.02, 10.0  # m, N: units of observations
 ACTIONS = ("residual", "absolute")
 OBSERVATIONS = ("flat", "dict")
 RESET_OPTIONS = ("q0", "phase", "randomize")
-# Name -> numbers of the observation's parts, in the flat box's order; the action's own follow.
-PARTS = {"joint": 2, "hand": 66, "contact": 5, "reference": 2 + 63 + 4 * len(PREVIEW)}
-
-
-_MEANS = np.zeros((2, 21))  # of finger tips, of the palm
-_MEANS[0, list(TIPS)], _MEANS[1, list(PALM)] = 1 / len(TIPS), 1 / len(PALM)
-_STEPS, _AHEAD = np.arange(SUBSTEPS), np.array((0.0, *PREVIEW))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(..., 3); np.cross costs more than a simulation step."""
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    u, v, w = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
-
-
-def apply_residual(joints: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """Landmarks (..., 21, 3) m, moved, turned about the palm and closed by actions (..., 7); leading axes broadcast."""
-    action = np.asarray(action, float)
-    means = _MEANS @ joints
-    moved = joints + (CLOSURE * action[..., 6, None] * CURL)[..., None] * (means[..., :1, :] - joints)
-    rotvec = ROTATION * action[..., 3:6]
-    if rotvec.any():
-        square = (rotvec * rotvec).sum(-1)[..., None, None]
-        angle = np.sqrt(square)
-        K = np.zeros((*rotvec.shape, 3))
-        x, y, z = rotvec[..., 0], rotvec[..., 1], rotvec[..., 2]
-        K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -z, y, -x
-        K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = z, -y, x
-        # Rodrigues with sin(a)/a and (1 - cos(a))/a^2, so that nothing is divided by zero.
-        rotation = np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (K @ K)
-        # As what is added to the landmarks, so that no turn adds nothing at all.
-        moved = moved + (moved - means[..., 1:, :]) @ np.swapaxes(rotation, -1, -2)
-    return moved + TRANSLATION * action[..., None, :3]
+SURFACE = 128  # points of the link's surface that the finger tips' distance is taken to
 
 
 class Task:
@@ -72,6 +42,7 @@ class Task:
     Attributes:
         scene: what is simulated.  rows: its states.  n: how many.
         action_size, observation_parts (name -> size), scales (of reward terms).
+        translation: m that a residual action of 1 shifts the hand by.  reach: m of an absolute action of 1.
         q: (n,) the joint, rad or m.
     """
 
@@ -84,16 +55,18 @@ class Task:
         self.goal = reward == "sparse_goal"
         self.residual = action == "residual"
         self.action_size = RESIDUALS if self.residual else ABSOLUTES
-        self.observation_parts = {**PARTS, "action": self.action_size}
         self._hand = hand_rows(scene, rows)
-        self._lead, self._touch = scene.hand.lead, touch_columns(scene)
+        self._layout = Layout(self.action_size)
+        self.observation_parts = self._layout.parts
+        self._motion = Motion(scene, self._hand.weights, self._layout)
+        self._scale, self._raw = self._layout.scale(scene), np.zeros((rows.n, self._layout.size))
+        self._lead, self._depth = scene.hand.lead, touch_columns(scene)[1]
         reference, demo, model = self.asset.reference, self.asset.demo, scene.model
-        self._times, self._reference_q = reference.time, reference.q
-        self._joints = reference.hand_joints
+        self._times, self._joints = reference.time, reference.hand_joints
         self._stroke = demo["q_demo_end"] - demo["q_start"]
-        self._direction = float(np.sign(self._stroke))
+        self.translation = residual_translation(self.asset, scene.size)
         away = np.abs(self._joints - self._joints[0]).max()
-        self.reach = float(max(1.25 * away, 0.1))  # m, of an absolute action of 1
+        self.reach = float(max(1.25 * away, 0.1))
         rate = np.linalg.norm(np.diff(self._joints, axis=0), axis=-1) / np.diff(self._times)[:, None]
         self._stride = float(max(HAND_SPEED, 1.5 * rate.max())) * CONTROL_PERIOD  # m an environment step
         joint = model.joint("joint")
@@ -103,24 +76,35 @@ class Task:
         self._nominal = randomize.nominal(self.asset, model.jnt_axis[joint.id], model.jnt_pos[joint.id])
         self._hinge = self.asset.joint_type == "revolute"
         self._draws = [self._nominal] * self.n
+        surface = scene.surface[np.linspace(0, len(scene.surface) - 1, SURFACE).astype(int)]
+        # |a - b|^2 = |a|^2 + (a, 1) (-2 b, |b|^2): one product for all pairs
+        self._surface = np.concatenate([-2 * surface, (surface * surface).sum(1, keepdims=True)], 1).T
         n, frames = self.n, len(self._times)
         self._axis = np.tile(self._nominal.axis, (n, 1))
         self._point = np.tile(self._nominal.point, (n, 1))
-        self._offset, self._start, self._count = np.zeros((n, 3)), np.zeros(n), np.zeros(n, int)
-        self._clock, self._first, self._driven = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._offset, self._time, self._clock = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
+        self._first, self._driven = np.zeros(n), np.zeros(n)
         self._succeeded, self._diverged = np.zeros(n, bool), np.zeros(n, bool)
         self._action = np.zeros((n, self.action_size), np.float32)
-        self._aim = np.zeros((n, 21, 3))
+        self._correction = np.zeros((n, CORRECTIONS))
+        self._aim = np.zeros((n, self._motion.count, 3))
         self._seen, self._hit = np.zeros((n, frames), bool), np.zeros((n, frames), bool)
-        self._contact, self._force, self._torque = np.zeros(n, bool), np.zeros((n, 3)), np.zeros(n)
+        self._push = np.zeros((n, 5))  # of the hand on the link: whether, force (N), moment about the joint
 
     # The arrays above that an episode changes; with the rows' states they are all there is to a snapshot.
-    EPISODE = ("_axis", "_point", "_offset", "_start", "_count", "_clock", "_first", "_driven", "_succeeded",
-               "_diverged", "_action", "_aim", "_seen", "_hit", "_contact", "_force", "_torque")
+    EPISODE = ("_axis", "_point", "_offset", "_time", "_clock", "_first", "_driven", "_succeeded", "_diverged",
+               "_action", "_correction", "_aim", "_seen", "_hit", "_push")
+    # Of those, what a step changes.
+    _STEP = EPISODE[3:5] + EPISODE[6:]
 
     @property
     def q(self) -> np.ndarray:
         return self.rows.qpos[:, self.scene.qpos].copy()
+
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) s, the reference's clock."""
+        return self._time.copy()
 
     def path(self, t: np.ndarray) -> np.ndarray:
         """(..., 21, 3) m: the demonstrated landmarks at times t (...), s of the reference."""
@@ -149,7 +133,7 @@ class Task:
             raise ValueError(f"phase must lie in [0, 1], is {phase}")
         low, high = self.range
         time = float(self._times[0]) + phase * self.asset.demo["duration"]
-        q0 = float(np.clip(np.interp(time, self._times, self._reference_q), low, high))
+        q0 = float(np.clip(np.interp(time, self._times, self.asset.reference.q), low, high))
         if options.get("q0") is not None:
             q0 = float(options["q0"])
         if not low <= q0 <= high:
@@ -171,29 +155,17 @@ class Task:
         self._apply(row, made)
         ids = np.array([row])
         self._offset[row] = 0.0 if made.hand is None else made.hand
-        self._start[row], self._count[row], self._clock[row] = time, 0, 0.0
+        self._time[row], self._clock[row] = time, 0.0
         self._first[row] = np.clip(float(self.asset.stroke_fraction(q0)), 0.0, 1.0)
-        self._driven[row] = 0.0
-        for flags in (self._succeeded, self._diverged, self._seen, self._hit, self._contact):
-            flags[row] = False
-        self._action[row], self._force[row], self._torque[row] = 0.0, 0.0, 0.0
-        self._aim[row] = self.path(np.array(time)) + self._offset[row]
+        for values in (self._driven, self._succeeded, self._diverged, self._seen, self._hit, self._push,
+                       self._action, self._correction):
+            values[row] = 0
+        joints = self.path(np.array(time)) + self._offset[row]
+        self._aim[row] = self._hand.targets(joints)
         self.rows.clear(ids)
         self.rows.qpos[row, self.scene.qpos] = q0
-        self._hand.place(ids, self._aim[ids])
+        self._hand.place(ids, joints[None])
         self.rows.forward(ids)
-
-    def targets(self, action: np.ndarray) -> np.ndarray:
-        """(n, SUBSTEPS, 21, 3) m: where the landmarks are to be in the next step's substeps, for actions (n, A)."""
-        steps, offset = _STEPS, self._offset[:, None, None, :]
-        if self.residual:
-            t = self._start[:, None] + (self._count[:, None] + steps) * TIMESTEP + self._lead
-            return apply_residual(self.path(t), action[:, None]) + offset
-        goal = self._joints[0] + self.reach * action.reshape(self.n, 21, 3) + self._offset[:, None]
-        way = goal - self._aim
-        length = np.sqrt((way * way).sum(-1, keepdims=True))
-        way *= self._stride / np.maximum(length, self._stride)
-        return self._aim[:, None] + ((steps + 1) / SUBSTEPS)[:, None, None] * way[:, None]
 
     def step(self, action: np.ndarray, ids: np.ndarray | None = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """One environment step of all simulations, or of those of ``ids`` (the others' rows of results mean nothing).
@@ -205,46 +177,33 @@ class Task:
             rewards (n,), and the scaled reward terms (n,) each.
         """
         action = np.minimum(np.maximum(np.asarray(action, np.float32), -1.0), 1.0)
-        n, rows, hand, column = self.n, self.rows, self._hand, self.scene.qpos
-        targets = self.targets(action.astype(float))
-        aims = hand.targets(targets)
-        q = np.empty((n, SUBSTEPS + 1))
-        touch = np.empty((n, SUBSTEPS, rows.sensordata.shape[1]))
-        q[:, 0] = rows.qpos[:, column]
-        for k in range(SUBSTEPS):
-            hand.control(aims[:, k])
-            rows.step(ids)
-            q[:, k + 1] = rows.qpos[:, column]
-            touch[:, k] = rows.sensordata
+        n, rows, column = self.n, self.rows, self.scene.qpos
         if ids is not None:  # results of others are not to change their episodes
-            kept = {name: getattr(self, name).copy() for name in ("_hit", "_seen", *self._STEP)}
-        force, torque, position, depth = decode_touch(self._touch, touch)
-        contact = (force * force).sum(-1) > 0  # (n, SUBSTEPS)
-        load = (force * self._axis[:, None]).sum(-1)
-        if self._hinge:
-            moment = torque + _cross(position - self._point[:, None], force)
-            load = (moment * self._axis[:, None]).sum(-1)
-        moved = q[:, 1:] - q[:, :-1]
-        driven = np.where((moved * self._direction > 0) & (load * moved > 0), np.abs(moved), 0.0).sum(1)
-        driven = driven / abs(self._stroke)
-        self._mark(contact)
-        self._count = self._count + SUBSTEPS
+            kept = {name: getattr(self, name).copy() for name in self._STEP}
+        before, q = self._time, rows.qpos[:, column].copy()
+        aim = self._targets(action.astype(float))
+        self._hand.advance(self._aim, aim, ids)
+        self._aim = aim
+        moved = (rows.qpos[:, column] - q) / self._stroke
+        self._push = self._touch()
+        contact, load = self._push[:, 0] > 0, self._push[:, 4]
+        driven = np.where((moved > 0) & (load * self._stroke > 0), moved, 0.0)
+        self._mark(before, contact)
         clock = rows.time
         # MuJoCo begins anew, its clock at zero, where a state is no longer finite.
         self._diverged = self._diverged | (clock < self._clock + (SUBSTEPS - 0.5) * TIMESTEP)
         self._clock = clock
         self._driven = self._driven + driven
-        self._contact, self._force, self._torque = contact.any(1), force.mean(1), load.mean(1)
-        self._aim = targets[:, -1].copy()
         success = self.success()
         self._succeeded = self._succeeded | success
         distance = np.zeros(n)
-        free = ~self._contact
+        free = ~contact
         if "reach" in self.scales and free.any():
-            distance[free] = self._surface_distance(free, q[free, -1])
+            distance[free] = self._surface_distance(self._tips()[free])
+        depth = np.maximum(-rows.sensordata[:, self._depth], 0.0)
         terms = reward_terms(RewardInputs(
-            driven=driven, moved=(q[:, -1] - q[:, 0]) / self._stroke, contact=self._contact, distance=distance,
-            penetration=depth.max(1), action=action, previous_action=self._action, success=success), self.scales)
+            driven=driven, moved=moved, contact=contact, distance=distance, penetration=depth, action=action,
+            previous_action=self._action, success=success), self.scales)
         self._action = action.copy()
         if ids is not None:
             others = np.ones(n, bool)
@@ -255,28 +214,55 @@ class Task:
             return goal_reward(self.achieved(), np.broadcast_to(GOAL, (n, 2))), terms
         return (sum(terms.values()) if terms else np.zeros(n)), terms
 
-    _STEP = ("_count", "_clock", "_driven", "_diverged", "_contact", "_force", "_torque", "_aim", "_succeeded",
-             "_action")
+    def _targets(self, action: np.ndarray) -> np.ndarray:
+        """(n, S, 3) m where the hand's targets are to be after a step of actions (n, A); sets clock and correction."""
+        if self.residual:
+            way = action[:, :CORRECTIONS] - self._correction
+            self._correction = self._correction + np.minimum(np.maximum(way, -SLEW), SLEW)
+            self._time = np.maximum(self._time + CONTROL_PERIOD * (1 + PACE * action[:, CORRECTIONS]), self._times[0])
+            return self._motion.many(self._time + self._lead, self._correction, self.translation, self._offset)
+        self._time = self._time + CONTROL_PERIOD
+        goal = self._joints[0] + self.reach * action.reshape(self.n, 21, 3) + self._offset[:, None]
+        way = goal - self._aim[:, :21]
+        length = np.sqrt((way * way).sum(-1, keepdims=True))
+        way *= self._stride / np.maximum(length, self._stride)
+        return self._hand.targets(self._aim[:, :21] + way)
 
-    def _mark(self, contact: np.ndarray) -> None:
-        """Note which of the reference's frames were played, and in which the hand pushed (n, SUBSTEPS)."""
-        t = self._start[:, None] + (self._count[:, None] + _STEPS) * TIMESTEP
-        frame = self._times.searchsorted(t + 1e-9, side="right") - 1
-        index = frame + np.arange(self.n)[:, None] * len(self._times)
-        self._seen.ravel()[index] = True
-        self._hit.ravel()[index[contact]] = True
+    def _touch(self) -> np.ndarray:
+        """(n, 5): whether the hand pushed on the link in the substeps just made, its mean force and that one's moment
+        about the joint (along it, for a slide)."""
+        touches = self.rows.touches
+        total = touches.sum(1)
+        # MuJoCo gives the wrench from the link on the hand, about the contact's place.
+        force, torque = -total[:, 1:4] / SUBSTEPS, -total[:, 4:7] / SUBSTEPS
+        if self._hinge:
+            g = -(touches[:, :, 1:4].transpose(0, 2, 1) @ touches[:, :, 7:10]) / SUBSTEPS  # force x place, summed
+            p = self._point
+            torque += np.stack([g[:, 2, 1] - g[:, 1, 2] - p[:, 1] * force[:, 2] + p[:, 2] * force[:, 1],
+                                g[:, 0, 2] - g[:, 2, 0] - p[:, 2] * force[:, 0] + p[:, 0] * force[:, 2],
+                                g[:, 1, 0] - g[:, 0, 1] - p[:, 0] * force[:, 1] + p[:, 1] * force[:, 0]], -1)
+        load = ((torque if self._hinge else force) * self._axis).sum(-1)
+        return np.concatenate([(force * force).sum(-1, keepdims=True) > 0, force, load[:, None]], 1)
 
-    def _surface_distance(self, rows: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """(m,) m, least distance of the finger tips to the corners of the moving link's collision surface."""
-        tips = self._hand.landmarks()[rows][:, TIPS]
-        axis, point = self._axis[rows][:, None], self._point[rows][:, None]
-        if self._hinge:  # into the link's own frame: back by q
-            arm, c, s = tips - point, np.cos(q)[:, None, None], np.sin(-q)[:, None, None]
-            local = point + arm * c + _cross(axis, arm) * s + axis * ((arm * axis).sum(-1, keepdims=True) * (1 - c))
-        else:
-            local = tips - axis * q[:, None, None]
-        surface = self.scene.surface
-        square = ((local * local).sum(-1)[..., None] - 2 * local @ surface.T + (surface * surface).sum(-1))
+    def _mark(self, before: np.ndarray, contact: np.ndarray) -> None:
+        """Note which of the reference's frames were played since its clock said so (n,), and in which the hand pushed
+        (n,)."""
+        begin, end = np.minimum(before, self._time), np.maximum(before, self._time)
+        first = self._times.searchsorted(begin + 1e-9, side="right") - 1
+        last = self._times.searchsorted(end - 1e-9, side="right") - 1
+        frames = np.arange(len(self._times))
+        played = (frames >= first[:, None]) & (frames <= np.maximum(last, first)[:, None])
+        self._seen = self._seen | played
+        self._hit = self._hit | (played & contact[:, None])
+
+    def _tips(self) -> np.ndarray:
+        """(n, 5, 3) m, the finger tips in the moving link's frame (of the last substep's beginning)."""
+        here = self._hand.landmarks()[:, TIPS]
+        return (here - self.rows.link_pos[:, None]) @ self.rows.link_mat
+
+    def _surface_distance(self, tips: np.ndarray) -> np.ndarray:
+        """(m,) m, least distance of finger tips (m, 5, 3) to points of the moving link's surface, in its frame."""
+        square = (tips * tips).sum(-1)[..., None] + tips @ self._surface[:3] + self._surface[3]
         return np.sqrt(np.maximum(square.min((1, 2)), 0.0))
 
     def success(self) -> np.ndarray:
@@ -307,38 +293,36 @@ class Task:
         count = wanted.sum(1)
         return {"joint_progress": self.asset.progress(q),
                 "final_q_error": np.abs(q - demo["q_demo_end"]) / (demo["q_max"] - demo["q_min"]),
-                "is_success": self._succeeded.copy(), "success_now": self.success(), "contact": self._contact.copy(),
+                "is_success": self._succeeded.copy(), "success_now": self.success(), "contact": self._push[:, 0] > 0,
                 "contact_fraction": (wanted & self._hit).sum(1) / np.maximum(count, 1), "diverged": self.diverged}
 
-    def observation(self) -> dict[str, np.ndarray]:
-        """Name -> (n, size) float32 parts, clipped to [-10, 10]; new arrays."""
-        asset, duration = self.asset, self.asset.demo["duration"]
-        t = self._start + self._count * TIMESTEP
-        here = self._hand.landmarks()
-        times = t[:, None] + _AHEAD
-        ahead = self.path(times)  # (n, 1 + previews, 21, 3)
-        moments = np.interp(times, self._times, self._reference_q)
-        stroke = asset.stroke_fraction(moments)
-        centres = ahead.mean(2)
-        n, size = self.n, self.scene.size
-        lever = size if self._hinge else 1.0
-        parts = {
-            "joint": [self.fraction()[:, None], (self.rows.qvel[:, self.scene.dof] * duration / self._stroke)[:, None]],
-            "hand": [((here - self.scene.centre) / size).reshape(n, 63), self._hand.velocity()],
-            "contact": [self._contact[:, None], self._force / FORCE_SCALE, self._torque[:, None] / FORCE_SCALE / lever],
-            "reference": [np.minimum((t - self._times[0]) / duration, 1.0)[:, None], stroke[:, :1],
-                          ((ahead[:, 0] + self._offset[:, None] - here) / ERROR_SCALE).reshape(n, 63), stroke[:, 1:],
-                          ((centres[:, 1:] - centres[:, :1]) / size).reshape(n, 3 * len(PREVIEW))],
-            "action": [self._action],
-        }
-        return {name: np.minimum(np.maximum(np.concatenate(values, 1), -10.0), 10.0).astype(np.float32)
-                for name, values in parts.items()}
+    def observation(self) -> np.ndarray:
+        """(n, size) float32, flat, clipped to [-10, 10]; a new array. See :class:`taa_envs.motion.Layout`."""
+        raw, layout, here = self._raw, self._layout, self._hand.landmarks()
+        hand, contact = layout.at["hand"].start, layout.at["contact"].start
+        raw[:, 0] = raw[:, 2] = self.fraction()
+        raw[:, 1] = self.rows.qvel[:, self.scene.dof]
+        raw[:, hand:hand + 63] = here.reshape(self.n, 63)
+        raw[:, hand + 63:hand + 66] = self._hand.velocity()
+        raw[:, contact:contact + 5] = self._push
+        raw[:, layout.error] = (here - self._offset[:, None]).reshape(self.n, 63)
+        raw[:, layout.at["grip"]] = self._tips().reshape(self.n, 15)
+        start = layout.at["action"].start
+        raw[:, start:] = self._action
+        if self.residual:
+            raw[:, start:start + CORRECTIONS] = self._correction
+        out = raw * self._scale + self._motion.shown.many(self._time)
+        return np.minimum(np.maximum(out, -10.0), 10.0).astype(np.float32)
+
+    def parts_of(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+        """Name -> (n, size) copies of a flat observation's parts."""
+        return {name: flat[:, columns].copy() for name, columns in self._layout.at.items()}
 
     def reference_action(self) -> np.ndarray:
         """(n, A): the action that follows the demonstrated hand in the next step; zeros for residual actions."""
         if self.residual:
             return np.zeros((self.n, RESIDUALS), np.float32)
-        t = self._start + (self._count + SUBSTEPS) * TIMESTEP + self._lead
+        t = self._time + CONTROL_PERIOD + self._lead
         return ((self.path(t) - self._joints[0]) / self.reach).reshape(self.n, ABSOLUTES).astype(np.float32)
 
     def snapshot(self, row: int) -> dict[str, Any]:

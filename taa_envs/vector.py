@@ -36,6 +36,8 @@ class BatchedArticulationEnv(VectorEnv):
             ``info["final_obs"]`` and ``info["final_info"]``) or "disabled"
             (``reset(options={"reset_mask": mask})`` starts those of the (n,) bool mask).
         threads: of the pool; 0 for one a CPU.
+        hold: steps for which an action is held; rewards are summed over them. Observations, infos and the next episode
+            come after the last; an episode that ends before waits for it.
 
     Rendering is left to the single environment.
     """
@@ -44,9 +46,10 @@ class BatchedArticulationEnv(VectorEnv):
                 "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(self, asset: str | os.PathLike | Asset, num_envs: int = 1, max_episode_steps: int | None = None,
-                 autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, threads: int = 0, hand: str = "points",
-                 reward: str | Mapping[str, float] = "dense", action: str = "residual", observation: str = "flat",
-                 randomize: Any = False, touch_static: bool = False, reference: str = "demonstration") -> None:
+                 autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, threads: int = 0, hold: int = 1,
+                 hand: str = "points", reward: str | Mapping[str, float] = "dense", action: str = "residual",
+                 observation: str = "flat", randomize: Any = False, touch_static: bool = False,
+                 reference: str = "demonstration") -> None:
         self.asset = with_reference(get_asset(asset), reference, hand)
         self.num_envs = num_envs
         if isinstance(autoreset_mode, str) and not isinstance(autoreset_mode, AutoresetMode):
@@ -64,7 +67,10 @@ class BatchedArticulationEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._observed, self._randomize = observation, randomize
-        self._limit = max_episode_steps or default_steps(self.asset.demo["duration"])
+        self.max_episode_steps = max_episode_steps or default_steps(self.asset.demo["duration"])
+        if hold < 1:
+            raise ValueError(f"hold must be at least 1, is {hold}")
+        self.hold = hold
         self._steps = np.zeros(num_envs, int)
         self._over = np.zeros(num_envs, bool)
         self._generators: list[np.random.Generator] = [seeding.np_random(None)[0] for _ in range(num_envs)]
@@ -112,17 +118,19 @@ class BatchedArticulationEnv(VectorEnv):
         if len(starting) and self._mode == AutoresetMode.DISABLED:
             raise ValueError(f"episodes {starting.tolist()} are over; reset them with the option reset_mask")
         live = ~self._over
-        ids = None if not len(starting) else np.flatnonzero(live)
-        rewards, terms = np.zeros(self.num_envs), {}
-        if live.any():
-            rewards, terms = self.task.step(actions, ids)
-        rewards = np.where(live, rewards, 0.0)
-        terms = {name: np.where(live, value, 0.0) for name, value in terms.items()}
-        self._steps[live] += 1
+        rewards, terms = np.zeros(self.num_envs), dict.fromkeys(self.task.scales, 0.0)
+        terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
+        for _ in range(self.hold):
+            if not live.any():
+                break
+            reward, some = self.task.step(actions, None if live.all() else np.flatnonzero(live))
+            rewards += np.where(live, reward, 0.0)
+            terms = {name: terms[name] + np.where(live, value, 0.0) for name, value in some.items()}
+            self._steps[live] += 1
+            terminated |= live & (self.task.success() | self.task.diverged)
+            truncated |= live & (self._steps >= self.max_episode_steps)
+            live = live & ~(terminated | truncated)
         drawn = self._begin(starting)
-        ended = self.task.success() | self.task.diverged
-        terminated = live & ended
-        truncated = live & (self._steps >= self._limit)
         self._over = terminated | truncated
         info = self._info(terms, drawn, np.ones(self.num_envs, bool))
         if self._mode == AutoresetMode.SAME_STEP and self._over.any():
@@ -140,7 +148,7 @@ class BatchedArticulationEnv(VectorEnv):
         info: dict[str, Any] = {}
         for name, value in self.task.info().items():
             info[name], info[f"_{name}"] = value, mask.copy()
-        info["reward_terms"] = {name: np.array(value) for name, value in terms.items()}
+        info["reward_terms"] = {name: np.array(np.broadcast_to(value, self.num_envs)) for name, value in terms.items()}
         drawn = {row: made for row, made in drawn.items() if made}
         if drawn:
             names = next(iter(drawn.values()))
@@ -152,6 +160,11 @@ class BatchedArticulationEnv(VectorEnv):
                     arrays[name][row] = value
             info["randomized"], info["_randomized"] = arrays, flags
         return info
+
+    @property
+    def steps(self) -> np.ndarray:
+        """(num_envs,) steps made in the running episodes; of one that has ended, its length until the next begins."""
+        return self._steps.copy()
 
     def reference_action(self) -> np.ndarray:
         """(num_envs, A): the actions that follow the demonstrated hand in the next step."""

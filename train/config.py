@@ -22,6 +22,7 @@ class Config:
         algo: "ppo" or "sac".  seed: of everything that draws.
         envs, steps, checkpoint_every: simulations at once, environment steps in all, and between checkpoints.
         reward, action, randomize: of the environment.
+        hold: environment steps for which the policy's action is held.
         algorithm, policy: arguments of the Stable-Baselines3 class and of its policy.
     """
 
@@ -32,6 +33,7 @@ class Config:
     reward: str = "dense"
     action: str = "residual"
     randomize: bool = True
+    hold: int = 5
     seed: int = 0
     algorithm: Mapping[str, Any] = field(default_factory=dict)
     policy: Mapping[str, Any] = field(default_factory=dict)

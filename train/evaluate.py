@@ -15,23 +15,21 @@ from taa_envs.errors import TaaEnvsError
 from taa_envs.files import written_whole
 from taa_envs.registry import max_episode_steps
 from taa_envs.vector import BatchedArticulationEnv
-from train.policy import load_policy
+from train.policy import Policy, load_policy
 
 BATCH = 32  # episodes at once
 
 
-def _act(policy: Any, env: BatchedArticulationEnv | ArticulationEnv, observation: np.ndarray) -> np.ndarray:
-    if policy is None:
-        return env.reference_action()
-    return policy.predict(observation, deterministic=True)[0]
+def _act(policy: Policy | None, env: BatchedArticulationEnv | ArticulationEnv, observation: np.ndarray) -> np.ndarray:
+    return env.reference_action() if policy is None else policy.act(observation)
 
 
-def episodes(asset: Asset, policy: Any, count: int, *, seed: int = 0, action: str = "residual",
+def episodes(asset: Asset, policy: Policy | None, count: int, *, seed: int = 0, action: str = "residual",
              randomize: Any = True) -> dict[str, np.ndarray]:
     """Run episodes 0 to count - 1, episode i under the seed ``seed + i``.
 
     Args:
-        policy: with ``predict``, as :func:`train.policy.load_policy` gives; None for the open-loop replay.
+        policy: as :func:`train.policy.load_policy` gives; None for the open-loop replay.
 
     Returns:
         success (count,) bool, progress (count,), steps (count,).
@@ -39,14 +37,15 @@ def episodes(asset: Asset, policy: Any, count: int, *, seed: int = 0, action: st
     out = {"success": np.zeros(count, bool), "progress": np.zeros(count), "steps": np.zeros(count, int)}
     for first in range(0, count, BATCH):
         n = min(BATCH, count - first)
-        env = BatchedArticulationEnv(asset, n, action=action, randomize=randomize)
+        env = BatchedArticulationEnv(asset, n, action=action, randomize=randomize,
+                                     hold=1 if policy is None else policy.hold)
         observation, _ = env.reset(seed=seed + first)
         running = np.ones(n, bool)
         while running.any():
             observation, _, terminated, truncated, info = env.step(_act(policy, env, observation))
-            out["steps"][first:first + n] += running
             ended = running & (terminated | truncated)
             rows = first + np.flatnonzero(ended)
+            out["steps"][rows] = env.steps[ended]
             out["success"][rows], out["progress"][rows] = info["is_success"][ended], info["joint_progress"][ended]
             running &= ~ended
         env.close()
@@ -86,12 +85,11 @@ def evaluate(asset: Asset, policy_file: str | os.PathLike, count: int = 100, *, 
             "gain": own["success"] - replay["success"]}
 
 
-def _check(asset: Asset, policy: Any, described: dict[str, Any]) -> None:
+def _check(asset: Asset, policy: Policy, described: dict[str, Any]) -> None:
     env = ArticulationEnv(asset, action=described["action"])
-    if (policy.observation_space.shape, policy.action_space.shape) != (env.observation_space.shape,
-                                                                      env.action_space.shape):
-        raise TaaEnvsError(f"the policy was made for observations {policy.observation_space.shape} and actions "
-                           f"{policy.action_space.shape}; TAA/{asset.id} has {env.observation_space.shape} and "
+    if policy.sizes != (env.observation_space.shape, env.action_space.shape):
+        raise TaaEnvsError(f"the policy was made for observations {policy.sizes[0]} and actions {policy.sizes[1]}; "
+                           f"TAA/{asset.id} has {env.observation_space.shape} and "
                            f"{env.action_space.shape}: train it again")
 
 
@@ -109,12 +107,13 @@ def record(asset: Asset, policy_file: str | os.PathLike, file: Path, *, seed: in
         for episode in range(count):
             seen = [env.reset(seed=seed + episode)[0] for env in envs]
             pictures = [env.render() for env in envs]
-            over = [False, False]
+            over, actions = [False, False], [np.zeros(0, np.float32)] * 2
             for step in range(max_episode_steps(asset.demo["duration"])):
                 for i, (env, acting) in enumerate(zip(envs, (policy, None), strict=True)):
                     if not over[i]:
-                        action = acting.predict(seen[i], deterministic=True)[0] if acting else env.reference_action()
-                        seen[i], _, over[i], _, _ = env.step(action)
+                        if acting is None or step % acting.hold == 0:
+                            actions[i] = _act(acting, env, seen[i])
+                        seen[i], _, over[i], _, _ = env.step(actions[i])
                         if step % 2 == 0 or over[i]:
                             pictures[i] = env.render()
                 if step % 2 and not all(over):

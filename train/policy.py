@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from stable_baselines3.common.policies import BasePolicy
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import written_whole
 from train.config import Config
+from train.vec import CLIP, Normal
 
-FORMAT = "taa-policy/1"
+FORMAT = "taa-policy/2"
 CLASSES: dict[str, Any] = {"ppo": PPO, "sac": SAC}
 
 
@@ -71,16 +73,35 @@ def load_torch(file: str | os.PathLike, kind: str) -> dict[str, Any]:
     return content
 
 
-def save_policy(file: Path, policy: BasePolicy, config: Config, asset_id: str) -> None:
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy. hold: environment steps for which its action is to be held."""
+
+    network: BasePolicy
+    normal: Normal
+    hold: int
+
+    @property
+    def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Shapes of its observations and actions."""
+        return self.network.observation_space.shape, self.network.action_space.shape
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """(..., A) float32 action of flat observations (..., size), without noise."""
+        return self.network.predict(self.normal(observation), deterministic=True)[0]
+
+
+def save_policy(file: Path, policy: BasePolicy, normal: Normal, config: Config, asset_id: str) -> None:
     """Write a trained policy."""
     save_torch(file, {"format": FORMAT, "algo": config.algo, "asset": asset_id, "action": config.action,
+                      "hold": config.hold, "mean": torch.from_numpy(normal.mean), "std": torch.from_numpy(normal.std),
                       "use_sde": bool(config.algorithm.get("use_sde", False)), "policy": dict(config.policy),
                       "observation_size": policy.observation_space.shape[0],
                       "action_size": policy.action_space.shape[0], "weights": policy.state_dict()})
 
 
-def load_policy(file: str | os.PathLike) -> tuple[BasePolicy, dict[str, Any]]:
-    """A policy (``predict(observation, deterministic=True)``) and its settings: algo, asset, action.
+def load_policy(file: str | os.PathLike) -> tuple[Policy, dict[str, Any]]:
+    """A policy and its settings: algo, asset, action.
 
     Args:
         file: ``policy.pt``, or the folder that holds it.
@@ -93,11 +114,12 @@ def load_policy(file: str | os.PathLike) -> tuple[BasePolicy, dict[str, Any]]:
     content = load_torch(file, FORMAT)
     try:
         made = CLASSES[content["algo"]].policy_aliases["MlpPolicy"](
-            spaces.Box(-10.0, 10.0, (content["observation_size"],), np.float32),
+            spaces.Box(-CLIP, CLIP, (content["observation_size"],), np.float32),
             spaces.Box(-1.0, 1.0, (content["action_size"],), np.float32), lambda _: 0.0,
             use_sde=content["use_sde"], **content["policy"])
         made.load_state_dict(content["weights"])
+        made.set_training_mode(False)
+        policy = Policy(made, Normal(content["mean"].numpy(), content["std"].numpy()), int(content["hold"]))
     except (KeyError, TypeError, RuntimeError, ValueError, AttributeError, MemoryError) as error:
         raise TaaEnvsError(f"{file} does not hold a whole policy ({str(error)[:100]}); train it again") from None
-    made.set_training_mode(False)
-    return made, {name: content[name] for name in ("algo", "asset", "action")}
+    return policy, {name: content[name] for name in ("algo", "asset", "action")}

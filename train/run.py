@@ -34,7 +34,7 @@ from taa_envs.files import written_whole
 from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config
 from train.policy import CLASSES, arrays, load_torch, save_policy, save_torch, tensors
-from train.vec import BatchedVecEnv
+from train.vec import BatchedVecEnv, Normal, replay_normal
 
 FORMAT = "taa-checkpoint/1"
 COLUMNS = ("steps", "episodes", "success", "return", "progress", "seconds")
@@ -80,9 +80,12 @@ def train(asset: Asset, config: Config, folder: Path, *, progress: Callable[[flo
     described = {"asset": asset.id, "model_sha256": hashlib.sha256(asset.model_path.read_bytes()).hexdigest(),
                  **{k: v for k, v in config.as_dict().items() if k not in ("steps", "checkpoint_every")}}
     _claim(folder, described)
-    env = BatchedVecEnv(BatchedArticulationEnv(
-        asset, config.envs, autoreset_mode="same_step", reward=config.reward, action=config.action,
-        randomize=config.randomize))
+    batch = BatchedArticulationEnv(asset, config.envs, autoreset_mode="same_step", reward=config.reward,
+                                   action=config.action, randomize=config.randomize, hold=config.hold)
+    checkpoint = folder / "checkpoint.pt"
+    content = arrays_of(checkpoint) if checkpoint.exists() else None
+    normal = replay_normal(batch, config.seed) if content is None else Normal(*content["normal"])
+    env = BatchedVecEnv(batch, normal)
     torch.set_num_threads(1)  # small networks: threads cost more than they bring, and results depend on them
     kind = CLASSES[config.algo]
     try:
@@ -96,31 +99,31 @@ def train(asset: Asset, config: Config, folder: Path, *, progress: Callable[[flo
         with torch.no_grad():
             model.policy.action_net.weight.zero_()
     episodes, rows = _Episodes(), []
-    chunk = config.envs * model.n_steps if config.algo == "ppo" else CHUNK
-    checkpoint = folder / "checkpoint.pt"
+    chunk = config.envs * model.n_steps if config.algo == "ppo" else max(CHUNK // config.hold, config.envs)
     resumed, seconds = 0, 0.0
-    if checkpoint.exists():
-        rows = _restore(model, env, episodes, arrays_of(checkpoint))
-        resumed, seconds = model.num_timesteps, rows[-1][-1] if rows else 0.0
-    begin, saved = time.monotonic() - seconds, model.num_timesteps
-    while model.num_timesteps < config.steps:
+    if content is not None:
+        rows = _restore(model, env, episodes, content)
+        resumed, seconds = model.num_timesteps * config.hold, rows[-1][-1] if rows else 0.0
+    begin, saved, made = time.monotonic() - seconds, resumed, resumed
+    while made < config.steps:
         # The first call resets the environments, the others go on.
         model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
-        rows.append([model.num_timesteps, episodes.count, *episodes.means(), time.monotonic() - begin])
+        made = model.num_timesteps * config.hold  # Stable-Baselines3 counts decisions
+        rows.append([made, episodes.count, *episodes.means(), time.monotonic() - begin])
         for name, value in zip(COLUMNS[1:], rows[-1][1:], strict=True):
             model.logger.record(f"taa/{name}", value)
-        model.logger.dump(model.num_timesteps)
+        model.logger.dump(made)
         if progress is not None:
-            progress(min(model.num_timesteps / config.steps, 1.0), dict(zip(COLUMNS, rows[-1], strict=True)))
-        if model.num_timesteps - saved >= config.checkpoint_every or model.num_timesteps >= config.steps:
-            save_torch(checkpoint, _checkpoint(model, env, episodes, rows))
-            save_policy(folder / "policy.pt", model.policy, config, asset.id)
+            progress(min(made / config.steps, 1.0), dict(zip(COLUMNS, rows[-1], strict=True)))
+        if made - saved >= config.checkpoint_every or made >= config.steps:
+            save_torch(checkpoint, _checkpoint(model, env, normal, episodes, rows))
+            save_policy(folder / "policy.pt", model.policy, normal, config, asset.id)
             _write_curve(folder / "curve.csv", rows)
-            saved = model.num_timesteps
+            saved = made
     env.close()
     last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
     return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
-            "steps": model.num_timesteps,
+            "steps": made,
             **{k: None if np.isnan(last[k]) else last[k] for k in ("success", "return", "progress") if k in last}}
 
 
@@ -151,7 +154,8 @@ def _write_curve(file: Path, rows: list[list[float]]) -> None:
         writer.writerows(rows)
 
 
-def _checkpoint(model: BaseAlgorithm, env: BatchedVecEnv, episodes: _Episodes, rows: list) -> dict[str, Any]:
+def _checkpoint(model: BaseAlgorithm, env: BatchedVecEnv, normal: Normal, episodes: _Episodes, rows: list
+                ) -> dict[str, Any]:
     _, variables = model._get_torch_save_params()
     state = np.random.get_state()  # noqa: NPY002 - the generator that Stable-Baselines3 draws from
     content = {
@@ -160,6 +164,7 @@ def _checkpoint(model: BaseAlgorithm, env: BatchedVecEnv, episodes: _Episodes, r
         "model": {"num_timesteps": model.num_timesteps, "_n_updates": model._n_updates,
                   "_episode_num": model._episode_num},
         "last_obs": model._last_obs, "last_episode_starts": model._last_episode_starts, "env": env.get_state(),
+        "normal": [normal.mean, normal.std],
         "torch": torch.get_rng_state(), "numpy": [state[1], state[2], state[3], state[4]],
         "actions": model.action_space.np_random.bit_generator.state,
         "episodes": {"count": episodes.count, "last": [list(e) for e in episodes.last]}, "rows": rows,

@@ -34,7 +34,7 @@ def test_equals_the_gymnasium_environment(action: str, door: Asset) -> None:
 def test_episode_ends(door: Asset) -> None:
     env = taa_envs.dm.load(door, reward="sparse")
     timestep = env.reset()
-    zero = np.zeros(7, np.float32)
+    zero = np.zeros(8, np.float32)
     while not timestep.last():
         timestep = env.step(zero)
     assert timestep.reward == 1.0 and timestep.discount == 0.0
@@ -69,4 +69,4 @@ class TestContract(test_utils.EnvironmentTestMixin, unittest.TestCase):
     def make_action_sequence(self):
         rng = np.random.default_rng(0)
         for _ in range(20):
-            yield rng.uniform(-1, 1, 7).astype(np.float32)
+            yield rng.uniform(-1, 1, 8).astype(np.float32)

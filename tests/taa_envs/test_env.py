@@ -22,7 +22,7 @@ from taa_envs.env import ArticulationEnv, apply_residual
 from taa_envs.registry import max_episode_steps
 from taa_envs.replay import replay
 
-ZERO = np.zeros(7, np.float32)
+ZERO = np.zeros(8, np.float32)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -102,7 +102,7 @@ def test_demonstration_succeeds_and_says_so() -> None:
 def test_hand_taken_away_fails_and_is_truncated() -> None:
     env = gymnasium.make("TAA/door", max_episode_steps=150)
     env.reset(seed=0)
-    away = np.array([1, 1, 0, 0, 0, 0, -1], np.float32)
+    away = np.array([1, 1, 0, 0, 0, 0, -1, 0], np.float32)
     for _ in range(150):
         _, _, terminated, truncated, info = env.step(away)
         assert not terminated
@@ -153,7 +153,7 @@ def test_dict_observation_is_the_flat_one_in_parts(door: Asset) -> None:
 
 def test_the_documentation_says_what_is_there(door: Asset) -> None:
     text = ArticulationEnv.__doc__
-    for kind, size in (("residual", 7), ("absolute", 63)):
+    for kind, size in (("residual", 8), ("absolute", 63)):
         env = ArticulationEnv(door, action=kind)
         assert env.action_space.shape == (size,) and f"Box(-1, 1, ({size},), float32)" in text
         assert str(env.observation_space.shape[0]) in text
@@ -188,7 +188,7 @@ def test_success_is_latched_and_instantaneous(door: Asset) -> None:
         pass
     env.data.qvel[env.task.scene.dof] = -3.0  # somebody slams it
     for _ in range(30):
-        info = env.step(np.array([1, 1, 0, 0, 0, 0, -1], np.float32))[4]
+        info = env.step(np.array([1, 1, 0, 0, 0, 0, -1, 0], np.float32))[4]
     assert info["joint_progress"] < 0.9 and info["is_success"] and not info["success_now"]
 
 
@@ -277,7 +277,7 @@ def test_what_is_returned_is_never_written_to_again(door: Asset) -> None:
     third = env.step(ZERO)[0]
     np.testing.assert_array_equal(observation, kept)
     assert info is not info2 and info["reward_terms"] is not info2["reward_terms"]
-    assert not np.shares_memory(second, third) and (third[-7:] == 0).all()
+    assert not np.shares_memory(second, third) and (third[-8:] == 0).all()
 
 
 def test_pickles_as_made() -> None:
@@ -303,6 +303,41 @@ def test_renders_in_each_mode() -> None:
 
 def test_make_through_the_module() -> None:
     assert gymnasium.make("taa_envs:TAA/door").unwrapped.asset.id == "door"
+
+
+def test_the_pace_holds_and_turns_back_the_demonstration(door: Asset) -> None:
+    env = ArticulationEnv(door)
+    env.reset(seed=0)
+    wait, back, ahead = (np.eye(8, dtype=np.float32)[7] * a for a in (-2 / 3, -1, 1))
+    clock = [env.task.time[0]]
+    for action in (ZERO, wait, ahead, back):
+        env.step(action)
+        clock.append(env.task.time[0])
+    np.testing.assert_allclose(np.diff(clock), [0.02, 0, 0.05, -0.01], atol=1e-8)
+    for _ in range(50):
+        env.step(back)
+    assert env.task.time[0] == door.reference.time[0]  # not before its beginning
+
+
+def test_corrections_reach_as_far_as_the_asset_is_uncertain(door: Asset, tmp_path: Path) -> None:
+    import dataclasses
+
+    from taa_envs.motion import residual_translation
+
+    unsure = dataclasses.replace(door, provenance={**door.provenance, "hand.offset": {"value": 0, "std": 0.03}})
+    assert residual_translation(door, 0.1) == 0.03
+    assert 0.09 <= residual_translation(unsure, 0.1) <= 0.1
+    env = ArticulationEnv(unsure)
+    env.reset(seed=0)
+    still = env.task._aim[0, :21].mean(0)
+    for _ in range(5):
+        env.step(np.array([1, 0, 0, 0, 0, 0, 0, -2 / 3], np.float32))
+    np.testing.assert_allclose(env.task._aim[0, :21].mean(0) - still, [env.task.translation, 0, 0], atol=1e-3)
+
+
+def test_actions_of_another_size_are_refused(door: Asset) -> None:
+    with pytest.raises(ValueError, match="8 numbers"):
+        ArticulationEnv(door).step(np.zeros(7, np.float32))
 
 
 def test_residual_moves_turns_and_closes(door: Asset) -> None:

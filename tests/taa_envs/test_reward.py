@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from taa_envs.reward import SCALES, TERMS, RewardInputs, goal_reward, reward_scales, reward_terms
+from taa_envs.reward import SCALES, TERMS, RewardInputs, goal_reward, reward_scales, reward_terms, scalar_terms
 
 
 def inputs(**changed: object) -> RewardInputs:
@@ -41,6 +41,8 @@ def test_arrays_agree_with_numbers() -> None:
     assert set(batch) == set(TERMS)
     for i in range(n):
         one = reward_terms(inputs(**{k: v[i] for k, v in many.items()}), SCALES["dense"])
+        plain = {k: v[i].tolist() for k, v in many.items()}
+        assert scalar_terms(**plain, scales=SCALES["dense"]) == pytest.approx(one, abs=1e-15)
         for name in TERMS:
             assert one[name] == pytest.approx(batch[name][i], abs=1e-15)
 

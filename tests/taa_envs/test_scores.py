@@ -73,7 +73,9 @@ def test_logs_that_are_no_logs(door: Asset, time: list, q: list, message: str) -
 
 
 def test_zero_actions_score_as_the_replay(door: Asset) -> None:
-    scores = score_actions(door, np.zeros((150, 7)))
+    scores = score_actions(door, np.zeros((150, 8)))
     assert scores["is_success"] and scores["joint_progress"] >= 0.95
+    assert score_actions(door, np.zeros((150, 7))) == scores
+    assert score_actions(door, np.zeros((150, 63)))["joint_progress"] < 0.1  # stays where the demonstration began
     with pytest.raises(ValueError, match="actions must be"):
         score_actions(door, np.zeros((150, 3)))

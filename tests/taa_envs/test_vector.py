@@ -18,7 +18,7 @@ def random_actions(count: int, n: int, size: int, scale: float = 0.4) -> np.ndar
 
 
 @pytest.mark.parametrize(("name", "action", "size", "count"),
-                         [("door", "residual", 7, 130), ("drawer", "residual", 7, 130), ("door", "absolute", 63, 40)])
+                         [("door", "residual", 8, 130), ("drawer", "residual", 8, 130), ("door", "absolute", 63, 40)])
 def test_equals_single_environments_step_by_step(name: str, action: str, size: int, count: int,
                                                  request: pytest.FixtureRequest) -> None:
     """Under gymnasium's own loop, with randomised models, over the ends of episodes."""
@@ -48,7 +48,7 @@ def test_dict_and_goal_observations(door: Asset) -> None:
         a, b = single.reset(seed=0)[0], batch.reset(seed=0)[0]
         assert batch.observation_space.contains(b)
         for _ in range(45):
-            ra, rb = single.step(np.zeros(7)), batch.step(np.zeros((2, 7)))
+            ra, rb = single.step(np.zeros(8)), batch.step(np.zeros((2, 8)))
         assert ra[1] == rb[1][0]
         for key in a:
             np.testing.assert_array_equal(ra[0][key], rb[0][key][0])
@@ -59,7 +59,7 @@ def test_made_by_name(asset_root, door: Asset, monkeypatch: pytest.MonkeyPatch) 
     taa_envs.register_assets()
     try:
         env = gymnasium.make_vec("TAA/door", 2, vectorization_mode="vector_entry_point", reward="sparse")
-        assert env.unwrapped._limit == gymnasium.spec("TAA/door").max_episode_steps
+        assert env.unwrapped.max_episode_steps == gymnasium.spec("TAA/door").max_episode_steps
         assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
         observation, _ = env.reset(seed=[4, 4])
         assert env.observation_space.contains(observation)
@@ -74,7 +74,7 @@ def test_autoreset_modes(door: Asset) -> None:
     def run(mode: str, steps: int = 13) -> list[tuple]:
         env = BatchedArticulationEnv(door, 2, max_episode_steps=6, autoreset_mode=mode, threads=1)
         env.reset(seed=0)
-        return [env.step(a) for a in random_actions(steps, 2, 7)]
+        return [env.step(a) for a in random_actions(steps, 2, 8)]
 
     later, at_once = run("next_step"), run("same_step")
     assert [bool(r[3][0]) for r in later] == [i in (5, 12) for i in range(13)]
@@ -87,7 +87,7 @@ def test_autoreset_modes(door: Asset) -> None:
 
     env = BatchedArticulationEnv(door, 2, max_episode_steps=3, autoreset_mode="disabled", threads=1)
     env.reset(seed=0)
-    for actions in random_actions(3, 2, 7):
+    for actions in random_actions(3, 2, 8):
         env.step(actions)
     with pytest.raises(ValueError, match="reset_mask"):
         env.step(actions)
@@ -101,7 +101,7 @@ def test_autoreset_modes(door: Asset) -> None:
 def test_a_snapshot_goes_on_as_the_episodes_did(door: Asset) -> None:
     env, other = (BatchedArticulationEnv(door, 3, max_episode_steps=30, randomize=True, threads=1) for _ in range(2))
     env.reset(seed=1)
-    actions = random_actions(60, 3, 7)
+    actions = random_actions(60, 3, 8)
     for a in actions[:25]:
         env.step(a)
     state = env.get_state()
@@ -113,11 +113,29 @@ def test_a_snapshot_goes_on_as_the_episodes_did(door: Asset) -> None:
             np.testing.assert_array_equal(x, y)
 
 
+def test_held_actions_are_the_same_steps(door: Asset) -> None:
+    """Rewards sum, an episode's end ends the hold, and the next begins after it."""
+    held = BatchedArticulationEnv(door, 2, max_episode_steps=8, autoreset_mode="same_step", hold=3, randomize=True,
+                                  threads=1)
+    plain = BatchedArticulationEnv(door, 2, max_episode_steps=8, autoreset_mode="disabled", randomize=True, threads=1)
+    np.testing.assert_array_equal(held.reset(seed=2)[0], plain.reset(seed=2)[0])
+    for k, action in enumerate(random_actions(3, 2, 8)):
+        steps = [plain.step(action) for _ in range(3 if k < 2 else 2)]
+        seen, rewards, terminated, truncated, info = held.step(action)
+        np.testing.assert_allclose(rewards, sum(s[1] for s in steps), atol=1e-12)
+        np.testing.assert_array_equal(info["final_obs"] if k == 2 else seen, steps[-1][0])
+        np.testing.assert_allclose(sum(info.get("final_info", info)["reward_terms"].values()), rewards, atol=1e-12)
+        assert truncated.all() == (k == 2) and not terminated.any()
+    np.testing.assert_array_equal(seen, plain.reset(options={"reset_mask": np.ones(2, bool)})[0])
+    with pytest.raises(ValueError, match="hold"):
+        BatchedArticulationEnv(door, 2, hold=0)
+
+
 def test_bad_arguments(door: Asset) -> None:
     env = BatchedArticulationEnv(door, 2, threads=1)
     with pytest.raises(ValueError, match="2 seeds"):
         env.reset(seed=[1])
-    with pytest.raises(ValueError, match=r"shape \(2, 7\)"):
-        env.step(np.zeros((3, 7)))
+    with pytest.raises(ValueError, match=r"shape \(2, 8\)"):
+        env.step(np.zeros((3, 8)))
     with pytest.raises(ValueError, match="known: q0"):
         env.reset(options={"speed": 1})

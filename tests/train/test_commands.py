@@ -16,7 +16,8 @@ def test_train_then_evaluate(door: Asset, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("TAA_ASSETS", str(door.path.parent))
     monkeypatch.chdir(tmp_path)
     settings = tmp_path / "small.toml"
-    settings.write_text("envs = 2\nsteps = 64\ncheckpoint_every = 64\n[algorithm]\nn_steps = 32\nbatch_size = 32\n")
+    settings.write_text("envs = 2\nsteps = 64\ncheckpoint_every = 64\nhold = 1\n"
+                        "[algorithm]\nn_steps = 32\nbatch_size = 32\n")
     assert main(["train", "door", "--config", str(settings), "--json"]) == 0
     made = json.loads(capfd.readouterr().out)
     assert made["steps"] == 64 and made["run"] == str(Path("runs") / "door-ppo-0")

@@ -23,10 +23,10 @@ from train.policy import load_policy
 from train.run import train
 from train.vec import BatchedVecEnv
 
-PPO = Config(algo="ppo", envs=2, steps=512, checkpoint_every=128, algorithm={"n_steps": 64, "batch_size": 64,
+PPO = Config(algo="ppo", envs=2, steps=1024, checkpoint_every=256, hold=2, algorithm={"n_steps": 64, "batch_size": 64,
              "n_epochs": 2}, policy={"net_arch": [16]})
-SAC = Config(algo="sac", envs=2, steps=300, checkpoint_every=100, algorithm={"buffer_size": 500, "learning_starts": 50,
-             "batch_size": 16, "gradient_steps": 1}, policy={"net_arch": [16]})
+SAC = Config(algo="sac", envs=2, steps=600, checkpoint_every=200, hold=2, algorithm={"buffer_size": 500,
+             "learning_starts": 50, "batch_size": 16, "gradient_steps": 1}, policy={"net_arch": [16]})
 
 
 class Killed(Exception):
@@ -42,7 +42,7 @@ def curve(folder: Path) -> list[list[str]]:
 @pytest.mark.parametrize("config", [PPO, SAC], ids=["ppo", "sac"])
 def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp_path: Path,
                                                 monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("train.run.CHUNK", 100)
+    monkeypatch.setattr("train.run.CHUNK", 200)
     whole = train(door, config, tmp_path / "whole")
     assert whole["resumed_at"] == 0 and whole["steps"] >= config.steps
 
@@ -56,15 +56,15 @@ def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp
     again = train(door, config, tmp_path / "killed")
     assert 0 < again["resumed_at"] < config.steps
     assert curve(tmp_path / "killed") == curve(tmp_path / "whole") and len(curve(tmp_path / "whole")) > 3
-    a, b = (load_policy(tmp_path / name)[0].state_dict() for name in ("whole", "killed"))
+    a, b = (load_policy(tmp_path / name)[0].network.state_dict() for name in ("whole", "killed"))
     assert all(torch.equal(a[key], b[key]) for key in a)
 
 
 def test_a_folder_holds_one_run(door: Asset, tmp_path: Path) -> None:
-    small = Config(**{**PPO.as_dict(), "steps": 128})
+    small = Config(**{**PPO.as_dict(), "steps": 256})
     train(door, small, tmp_path / "run")
     done = train(door, small, tmp_path / "run")
-    assert done["resumed_at"] == done["steps"] == 128  # nothing left to do
+    assert done["resumed_at"] == done["steps"] == 256  # nothing left to do
     with pytest.raises(TaaEnvsError, match="other settings"):
         train(door, Config(**{**small.as_dict(), "seed": 1}), tmp_path / "run")
     (tmp_path / "mine").mkdir()
@@ -75,7 +75,7 @@ def test_a_folder_holds_one_run(door: Asset, tmp_path: Path) -> None:
 
 
 def test_the_policy_loads_in_a_fresh_process(door: Asset, tmp_path: Path) -> None:
-    train(door, Config(**{**PPO.as_dict(), "steps": 128}), tmp_path / "run")
+    train(door, Config(**{**PPO.as_dict(), "steps": 256}), tmp_path / "run")
     here = evaluate(door, tmp_path / "run", 3)
     code = ("import sys, json; from taa_envs import load_asset; from train.evaluate import evaluate\n"
             "print(json.dumps(evaluate(load_asset(sys.argv[1]), sys.argv[2], 3)))")
@@ -99,9 +99,9 @@ def test_bad_policies_are_refused(door: Asset, tmp_path: Path) -> None:
             return os.mkdir, (str(tmp_path / "ran"),)
 
     (tmp_path / "evil.pt").write_bytes(pickle.dumps(Evil()))
-    torch.save({"format": "taa-policy/1", "x": Evil()}, tmp_path / "evil2.pt")
+    torch.save({"format": "taa-policy/2", "x": Evil()}, tmp_path / "evil2.pt")
     torch.save({"format": "other"}, tmp_path / "other.pt")
-    torch.save({"format": "taa-policy/1"}, tmp_path / "empty.pt")
+    torch.save({"format": "taa-policy/2"}, tmp_path / "empty.pt")
     for name in ("evil.pt", "evil2.pt", "other.pt", "empty.pt", "none.pt"):
         with pytest.raises(TaaEnvsError):
             evaluate(door, tmp_path / name, 1)
@@ -127,7 +127,7 @@ def test_vec_env_as_stable_baselines_wants_it(door: Asset) -> None:
     first = env.reset()
     total = 0.0
     for step in range(5):
-        seen, reward, done, infos = env.step(np.zeros((2, 7), np.float32))
+        seen, reward, done, infos = env.step(np.zeros((2, 8), np.float32))
         total += reward[0]
         assert done.all() == (step == 4)
     assert infos[0]["TimeLimit.truncated"] and infos[0]["episode"]["r"] == pytest.approx(total, abs=1e-6)
@@ -138,6 +138,6 @@ def test_vec_env_as_stable_baselines_wants_it(door: Asset) -> None:
 
 @pytest.mark.slow
 def test_video(door: Asset, tmp_path: Path) -> None:
-    train(door, Config(**{**PPO.as_dict(), "steps": 128}), tmp_path / "run")
+    train(door, Config(**{**PPO.as_dict(), "steps": 256}), tmp_path / "run")
     record(door, tmp_path / "run", tmp_path / "a.mp4", count=1, height=96)
     assert (tmp_path / "a.mp4").stat().st_size > 5000
