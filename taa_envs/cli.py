@@ -389,7 +389,7 @@ def error_sentence(error: BaseException) -> str:
     """One line for the user: what is wrong; what to do."""
     from taa_envs.errors import TaaEnvsError
 
-    if isinstance(error, shutil.Error):  # copying a folder: a list of (from, to, words), its errors' numbers in the words
+    if isinstance(error, shutil.Error):  # copying a folder: (from, to, words) of each file, numbers in the words
         number = re.search(r"\[Errno (\d+)\]", str(error))
         error = OSError(int(number[1]), os.strerror(int(number[1])), str(error.args[0][0][1])) if number else error
     text = " ".join(str(error).split())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import threading
 from pathlib import Path
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
 
 BONES = ((0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8), (5, 9), (9, 10), (10, 11), (11, 12), (9, 13),
          (13, 14), (14, 15), (15, 16), (13, 17), (17, 18), (18, 19), (19, 20), (0, 17))  # fmt: skip
+
+FRAME_RATE = 25.0
+"""Frames a second while it plays."""
 
 
 def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
@@ -62,6 +67,7 @@ def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
     reference = asset.reference
     time = server.gui.add_slider("time, s", float(reference.time[0]), float(reference.time[-1]), 0.01,
                                  float(reference.time[0]))  # fmt: skip
+    play = server.gui.add_button("play")
     low, high = asset.demo["q_min"], asset.demo["q_max"]
     q = server.gui.add_slider(f"joint, {asset.unit}", low, high, (high - low) / 200, float(np.clip(0.0, low, high)))
 
@@ -89,6 +95,26 @@ def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
         q.value = float(np.clip(reference.q[row], low, high))
         pose()
         hand(row)
+
+    running = threading.Event()
+
+    def run() -> None:
+        first, last = float(reference.time[0]), float(reference.time[-1])
+        while running.is_set():
+            begin = monotonic()
+            later = time.value + 1 / FRAME_RATE
+            time.value = first if later > last else later  # its callback moves joint and hand
+            sleep(max(0.0, 1 / FRAME_RATE - (monotonic() - begin)))
+
+    @play.on_click
+    def _(_: object) -> None:
+        if running.is_set():
+            running.clear()
+            play.label = "play"
+        else:
+            running.set()
+            play.label = "pause"
+            threading.Thread(target=run, daemon=True).start()
 
     pose()
     hand(0)

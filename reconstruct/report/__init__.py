@@ -14,7 +14,7 @@ from reconstruct.cues import HandReference, Hands, LinkMasks, Tracks
 from reconstruct.film import FILM_HEIGHT, FILM_NAME, fit_height, frame_rate, replay_frames, write_mp4
 from reconstruct.geometry import Geometry
 from reconstruct.joint.models import JointFit
-from reconstruct.report import draw, plots
+from reconstruct.report import draw, model3d, plots
 from reconstruct.video import Video
 from taa_envs.files import written_whole
 
@@ -58,8 +58,8 @@ def add_report(asset: Asset, video: Video, hands: Hands, tracks: Tracks, fit: Jo
         "lead": _lead(fit), "facts": _facts(asset, fit, result),
         "film": _encoded(draw.overlay_frames(video, HEIGHT, hands, tracks, fit, masks), rate),
         "replay_film": _encoded(replay_frames(asset, result, "points", HEIGHT, stride), replay_rate / stride),
-        "model_film": _encoded(draw.turntable(asset), 16.0),
-        "model_words": f"The joint goes through its demonstrated range twice in one turn. {words}.",
+        "model": model3d.view(fit, geometry, reference, video.time), "packed": model3d.plotly_packed(),
+        "script": (Path(__file__).parent / "model3d.js").read_text(encoding="utf-8"), "model_words": f"{words}.",
         "plot": plots.state_plot(video.time, fit, np.asarray(reference.contact, bool), result), "box": plots.BOX,
         "replay_rows": _replay_rows(result), "notes": list(dict.fromkeys(notes)),
         "numbers": _numbers(asset.provenance), "source": _source(asset.metadata), "seconds": _seconds(seconds),
@@ -102,7 +102,8 @@ def _page(context: Mapping) -> str:
 
     text = (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
     empty = dict.fromkeys(
-        ("facts", "replay_film", "plot", "model_film", "model_words", "replay_rows", "numbers", "refusal")
+        ("facts", "replay_film", "plot", "model", "packed", "script", "model_words", "replay_rows", "numbers",
+         "refusal")
     )
     return Environment(autoescape=True, undefined=StrictUndefined).from_string(text).render({**empty, **context})
 

@@ -121,35 +121,6 @@ def overlay_frames(video: Video, height: int, hands: Hands | None, tracks: Track
         yield label(overlay(video, t, height, hands, tracks, fit, masks), words)
 
 
-def turntable(asset: Asset, frames: int = 84, size: tuple[int, int] = (640, 480)) -> Iterator[np.ndarray]:
-    """The object alone, turning once around while its joint goes through its range and back twice, RGB."""
-    import mujoco
-
-    from taa_envs.scene import build_scene
-
-    scene = build_scene(asset, None)
-    phase = np.arange(frames) / frames
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-    camera.lookat[:] = scene.centre
-    camera.distance = 1.55 * scene.size
-    camera.elevation = -18.0
-    start = -90.0
-    if asset.camera is not None:
-        T = np.asarray(asset.camera["T_camera_world"], float)
-        view = scene.centre + T[:3, :3].T @ T[:3, 3]  # from the camera to the object
-        start = float(np.degrees(np.arctan2(view[1], view[0])))
-
-    def turned(k: int) -> object:
-        camera.azimuth = start + 360.0 * phase[k]
-        return camera
-
-    low, high = asset.demo["q_min"], asset.demo["q_max"]
-    states = np.zeros((frames, scene.model.nq))
-    states[:, scene.qpos] = low + (high - low) * (0.5 - 0.5 * np.cos(4 * np.pi * phase))
-    yield from rendered(asset, states, None, turned, size)
-
-
 def preview(
     video: Video,
     asset: Asset,
