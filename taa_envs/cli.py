@@ -24,6 +24,7 @@ import tyro
 
 from taa_envs import cli_commands as commands
 from taa_envs.cli_commands import Outcome
+from taa_envs.errors import TaaEnvsError
 
 
 @dataclass(kw_only=True)
@@ -143,8 +144,18 @@ class Replay(Common):
     """With --refine: folder of assets to write a copy with the refined reference into (default: the asset itself)."""
     reference: Literal["demonstration", "refined"] = "demonstration"
     """Which hand motion: as reconstructed, or what --refine found earlier."""
+    record: str | None = None
+    """Write replays as the Minari dataset of this name (`replay`: TAA/ID/replay-v0) instead of scoring one."""
+    episodes: int = 20
+    """With --record: how many, each under the asset's own randomisation, seeds from --seed on."""
+    overwrite: bool = False
+    """With --record: replace a dataset of that name."""
 
     def run(self) -> Outcome:
+        if self.record is not None:
+            if self.refine or self.video is not None or self.reference != "demonstration":
+                raise TaaEnvsError("--record writes plain replays; leave --refine, --reference and --video out")
+            return commands.record_replays(self.id, self.record, self.hand, self.episodes, self.seed, self.overwrite)
         return commands.replay(self.id, self.hand, self.video, self.refine, self.reference, self.out, self.seed,
                                self.seconds)  # fmt: skip
 
@@ -156,12 +167,15 @@ class Score(Common):
     id: tyro.conf.Positional[str]
     """Id of an asset."""
     file: tyro.conf.Positional[Path]
-    """A joint log (.csv with the columns time and q) or an action file (.npy, one row an environment step)."""
+    """A joint log (.csv with the columns time and q), an action file (.npy, one row an environment step), or the name
+    of a Minari dataset (TAA/ID/replay-v0)."""
     hand: str = "points"
-    """Hand whose actions an action file holds."""
+    """Hand whose actions an action file or another's dataset holds."""
+    episode: int = 0
+    """Which episode of a dataset."""
 
     def run(self) -> Outcome:
-        return commands.score(self.id, self.file, self.hand)
+        return commands.score(self.id, self.file, self.hand, self.episode)
 
 
 @dataclass(kw_only=True)
@@ -199,11 +213,16 @@ class Evaluate(Common):
     """How many."""
     video: Path | None = None
     """MP4 file to write: three episodes, the policy beside the replay."""
+    record: str | None = None
+    """Write the policy's episodes as the Minari dataset of this name too (a word stands for TAA/ID/WORD-v0)."""
+    overwrite: bool = False
+    """With --record: replace a dataset of that name."""
     seed: int = 1_000_000
     """Seed of the first episode; the others follow it."""
 
     def run(self) -> Outcome:
-        return commands.evaluate(self.id, self.policy, self.episodes, self.seed, self.video)
+        return commands.evaluate(self.id, self.policy, self.episodes, self.seed, self.video, self.record,
+                                 self.overwrite)  # fmt: skip
 
 
 @dataclass(kw_only=True)

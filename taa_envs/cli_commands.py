@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from taa_envs.arrays import read_npy
+from taa_envs.asset import Asset
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import folder_written_whole, written_whole
 
@@ -224,12 +225,46 @@ def replay(asset_id: str, hand: str, video: Path | None, refining: bool, referen
     return Outcome(data, words)
 
 
-def score(asset_id: str, file: Path, hand: str) -> Outcome:
+def _dataset_name(asset: Asset, name: str) -> str:
+    from taa_envs.datasets import default_name, is_dataset_name
+
+    return name if is_dataset_name(name) else default_name(asset, name)
+
+
+def record_replays(asset_id: str, name: str, hand: str, episodes: int, seed: int, overwrite: bool) -> Outcome:
+    from taa_envs import datasets, registry
+
+    asset = registry.get_asset(asset_id)
+    with StageBars() as bars:
+        begin = time.monotonic()
+        bars.start("record")
+        made = datasets.record(asset, _dataset_name(asset, name), episodes, seed=seed, hand=hand, overwrite=overwrite,
+                               progress=bars.update)  # fmt: skip
+        bars.finish(time.monotonic() - begin, f"{episodes} episodes")
+    again = list(datasets.replayed(asset, made))
+    data = {"dataset": made, "episodes": again}
+
+    def words() -> None:
+        same = sum(row["same"] for row in again)
+        print(f"dataset {made}, {same} of {len(again)} episodes the same when their actions are played again")
+        print(f'use     minari.load_dataset("{made}"); taa score {asset_id} {made} --episode 0')
+
+    return Outcome(data, words)
+
+
+def score(asset_id: str, file: Path, hand: str, episode: int) -> Outcome:
     from taa_envs import registry, scoring
 
     asset = registry.get_asset(asset_id)
     try:
-        if file.suffix == ".npy":
+        if not file.exists() and file.suffix not in (".npy", ".csv"):
+            from taa_envs.datasets import is_dataset_name, score_episode
+
+            if not is_dataset_name(file.as_posix()):
+                raise TaaEnvsError(f"no such file: {file}; give a joint log (.csv), an action file (.npy) or the name "
+                                   f"of a Minari dataset (TAA/{asset.id}/replay-v0)")  # fmt: skip
+            data = score_episode(asset, file.as_posix(), episode, hand)
+        elif file.suffix == ".npy":
             data = scoring.score_actions(asset, read_npy(file), hand)
         else:
             data = scoring.score_joint_log(asset, *read_joint_log(file))
@@ -435,7 +470,8 @@ def train(asset_id: str, algo: str, steps: int | None, envs: int | None, config:
     return Outcome(data, words)
 
 
-def evaluate(asset_id: str, policy: Path, episodes: int, seed: int, video: Path | None) -> Outcome:
+def evaluate(asset_id: str, policy: Path, episodes: int, seed: int, video: Path | None, name: str | None,
+             overwrite: bool) -> Outcome:  # fmt: skip
     from taa_envs import registry
 
     asset = registry.get_asset(asset_id)
@@ -447,6 +483,11 @@ def evaluate(asset_id: str, policy: Path, episodes: int, seed: int, video: Path 
     data = run(asset, policy, episodes, seed=seed)
     if video is not None:
         record(asset, policy, video, seed=seed)
+    if name is not None:
+        from train.evaluate import record_dataset
+
+        data["dataset"] = record_dataset(asset, policy, _dataset_name(asset, name), episodes, seed=seed,
+                                         overwrite=overwrite)  # fmt: skip
 
     def words() -> None:
         rows = [(name, f"{data[key]['success']:.0%}", "{:.0%} to {:.0%}".format(*data[key]["success_ci95"]),
@@ -456,6 +497,8 @@ def evaluate(asset_id: str, policy: Path, episodes: int, seed: int, video: Path 
                [("", "success", "95 % interval", "joint progress"), *rows], header=True)  # fmt: skip
         if video is not None:
             print(f"video   {video}")
+        if name is not None:
+            print(f"dataset {data['dataset']}")
 
     return Outcome(data, words)
 

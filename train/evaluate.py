@@ -93,6 +93,19 @@ def _check(asset: Asset, policy: Policy, described: dict[str, Any]) -> None:
                            f"{env.action_space.shape}: train it again")
 
 
+def record_dataset(asset: Asset, policy_file: str | os.PathLike, name: str, count: int = 20, *, seed: int = 1_000_000,
+                   overwrite: bool = False) -> str:
+    """Write a policy's episodes as a Minari dataset, see :func:`taa_envs.datasets.record`; its name."""
+    from taa_envs import datasets
+
+    policy, described = load_policy(policy_file)
+    _check(asset, policy, described)
+    if described["action"] != "residual":
+        raise TaaEnvsError("datasets hold residual actions; this policy's are " + described["action"])
+    return datasets.record(asset, name, count, seed=seed, act=policy.act, hold=policy.hold,
+                           algorithm=f"{described['algo']} policy", overwrite=overwrite)
+
+
 def record(asset: Asset, policy_file: str | os.PathLike, file: Path, *, seed: int = 1_000_000, count: int = 3,
            height: int = 360) -> None:
     """Write an MP4: the policy (left) beside the open-loop replay (right) in the same randomised episodes."""
