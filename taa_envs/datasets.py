@@ -21,7 +21,7 @@ import numpy as np
 from taa_envs.asset import Asset
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import folder_written_whole
-from taa_envs.registry import ENTRY_POINT, NAMESPACE, VECTOR_ENTRY_POINT, max_episode_steps
+from taa_envs.registry import CONTROL_PERIOD, ENTRY_POINT, NAMESPACE, VECTOR_ENTRY_POINT, max_episode_steps
 from taa_envs.scoring import score_actions
 
 KEY = "taa"  # of the metadata that only this module reads
@@ -93,7 +93,7 @@ def record(asset: Asset, name: str | None = None, episodes: int = 20, *, seed: i
         if progress is not None:
             progress((i + 1) / episodes)
     about = {"asset": asset.id, "model_sha256": _digest(asset), "hand": hand, "randomize": randomize,
-             "mujoco": mujoco.__version__, "control_period": env.unwrapped.dt}
+             "mujoco": mujoco.__version__, "control_period": CONTROL_PERIOD}
     with folder_written_whole(target, overwrite) as work:
         storage = MinariStorage.new(work / "data", env.observation_space, env.action_space, spec)
         storage.update_metadata({
