@@ -330,6 +330,26 @@ def meshes_from_cue(folder: Path, names: Iterable[str] = MESHES) -> dict[str, Li
     return links
 
 
+def moving_at_rest(link: LinkMesh, folder: CueFolder, fit: JointFit) -> LinkMesh:
+    """The moving link at q = 0; it stands in its file as in ``reference_frame`` of ``meshes/frame.npz`` (else frame 0).
+
+    Raises:
+        TaaError: there is no such frame.
+    """
+    if not folder.path("meshes/frame").is_file():
+        return link
+    frame = folder.read("meshes/frame", "reference_frame")["reference_frame"]
+    q = np.asarray(fit.q, float)
+    if frame.ndim or not 0 <= int(frame) < len(q):
+        raise TaaError(f"reference_frame of cues/meshes/frame.npz must be one of the {len(q)} frames")
+    back = np.linalg.inv(fit.link_pose(q[int(frame)]))
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return points @ back[:3, :3].T + back[:3, 3]
+
+    return replace(link, vertices=moved(link.vertices), parts=tuple((moved(v), f) for v, f in link.parts))
+
+
 def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), faces (F, 3) and colours (V, 4) uint8 of a binary glTF file; reads no other file.
 

@@ -360,6 +360,8 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
 
     def shape() -> Geometry:
         links = cues_io.meshes_from_cue(folder.folder, meshes) if folder and meshes else {}
+        if folder and "moving" in links:
+            links["moving"] = cues_io.moving_at_rest(links["moving"], folder, fit)
         if len(links) == len(cues_io.MESHES):
             built = Geometry(links["static"], links["moving"])
         else:

@@ -93,6 +93,23 @@ class Fit(Common):
 
 
 @dataclass(kw_only=True)
+class ImportScene(Common):
+    """Read the scene folder of the paper's released pipeline into a scene folder of ours."""
+
+    source: tyro.conf.Positional[Path]
+    """Its scene folder: any of da3/, masks/, trackcraft/, hawor_scaled/, registered_static/."""
+    scene: tyro.conf.Positional[Path]
+    """Scene folder to write; go on with `taa fit SCENE` or `taa reconstruct SCENE/video.mp4 --id ID --scene SCENE`."""
+    label: str | None = None
+    """The moving part, where several move."""
+    rate: float = 30.0
+    """Frames a second at which its frames were extracted."""
+
+    def run(self) -> Outcome:
+        return commands.import_scene(self.source, self.scene, self.label, self.rate)
+
+
+@dataclass(kw_only=True)
 class List(Common):
     """List the assets there are."""
 
@@ -322,6 +339,7 @@ class Doctor(Common):
 Command = (
     Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[ImportScene, tyro.conf.subcommand("import-scene")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[View, tyro.conf.subcommand("view")]

@@ -114,6 +114,25 @@ def fit(scene: Path, focal: float | None, out: Path | None, seed: int) -> Outcom
     return Outcome(joint, lambda: _table(f"{scene}: {joint['verdict']}", _joint_rows(joint)), refused)
 
 
+def import_scene(source: Path, scene: Path, label: str | None, rate: float) -> Outcome:
+    from reconstruct.import_scene import import_scene as run
+
+    data = run(source, scene, label, rate)
+
+    def words() -> None:
+        _table(f"{scene}: {data['frames']} frames of {data['size'][0]} x {data['size'][1]} px",
+               [("cue", "made from"), *data["cues"].items()], header=True)  # fmt: skip
+        if data["missing"]:
+            print(f"not there: {', '.join(data['missing'])}")
+        for note in data["notes"]:
+            print(f"note: {note}")
+        print(f"use     taa fit {scene}")
+        if data["video"]:
+            print(f"        taa reconstruct {data['video']} --id ID --scene {scene}")
+
+    return Outcome(data, words)
+
+
 def list_assets() -> Outcome:
     from taa_envs import registry
     from taa_envs.asset import read_metadata
