@@ -51,7 +51,8 @@ def import_scene(source: str | Path, scene: str | Path, label: str | None = None
 
     model = found.da3_model()
     metric = "NESTED" in model.upper()
-    put("frames", {"time": np.arange(len(found)) / rate}, _info("none", "scene folder", "frames"), "the frames' count")
+    times = {"time": np.arange(len(found)) / rate}
+    put("frames", times, _info("none", "scene folder", "frames"), "the frames' count")
     cameras = found.cameras()
     world = np.eye(4)
     if cameras is not None:
@@ -79,7 +80,8 @@ def import_scene(source: str | Path, scene: str | Path, label: str | None = None
         notes.append("frames/ is missing or incomplete; `taa fit` works from the cues, `taa reconstruct` needs a video")
     _facts(found, Path(scene), size, video)
     facts = {
-        "scene": str(scene), "video": str(video) if video else None, "source": str(Path(source).name), "frames": len(found), "size": list(size),
+        "scene": str(scene), "video": str(video) if video else None, "source": str(Path(source).name),
+        "frames": len(found), "size": list(size),
         "label": moving, "cues": cues, "missing": [name for name in wanted if name not in cues],
         "joints": found.joints(), "metric": metric, "notes": notes,
         "T_world_source": world.tolist(),
@@ -188,7 +190,7 @@ def _hand(found: ReleasedScene, size: tuple[int, int], cameras: tuple[np.ndarray
     hand, folder = got
     scaled = folder == "hawor_scaled"
     if not scaled:
-        notes.append(f"{folder}/ places the hand at its own depth; only its shape and its place in the picture are used")
+        notes.append(f"{folder}/ places the hand at its own depth; only its shape and its place in the picture count")
     put("hand", hand_arrays(hand, size, cameras[0], world @ cameras[1], scaled),
         _info("wilor" if folder == "wilor" else "hawor", folder, "hand"), f"{folder}/per_frame")  # fmt: skip
 

@@ -99,7 +99,7 @@ class ImportScene(Common):
     source: tyro.conf.Positional[Path]
     """Its scene folder: any of da3/, masks/, trackcraft/, hawor_scaled/, registered_static/."""
     scene: tyro.conf.Positional[Path]
-    """Scene folder to write; go on with `taa fit SCENE` or `taa reconstruct SCENE/video.mp4 --id ID --scene SCENE`."""
+    """Scene folder to write; go on with `taa fit SCENE`, or `taa reconstruct SCENE/video.mp4 --scene SCENE ...`."""
     label: str | None = None
     """The moving part, where several move."""
     rate: float = 30.0

@@ -1,11 +1,11 @@
-"""The scene folder of the paper's released pipeline (track-articulate-act): reading it, and writing what its scripts read.
+"""The scene folder of the paper's released pipeline (track-articulate-act): reading it, writing what its scripts read.
 
 What it holds and in which frames, as its scripts and documentation state it:
 
-- ``da3/``: ``cameras.npz`` (camera-to-world, quaternions xyzw), ``intrinsics.npz``, ``depth/<n>.npy`` (along the optical
-  axis), all counted by position in the sorted ``frames/``; cameras look right, down, forward.
-- ``masks/<label>/<stem>.png``, ``masks/tracking.json`` (per label ``motion``, ``keyframe_candidates``), ``hawor*/per_frame/``,
-  ``sam3d*/``, ``segvigen/``: counted by the frames' file names.
+- ``da3/``: ``cameras.npz`` (camera-to-world, quaternions xyzw), ``intrinsics.npz``, ``depth/<n>.npy`` (along the
+  optical axis), all counted by position in the sorted ``frames/``; cameras look right, down, forward.
+- ``masks/<label>/<stem>.png``, ``masks/tracking.json`` (per label ``motion``, ``keyframe_candidates``),
+  ``hawor*/per_frame/``, ``sam3d*/``, ``segvigen/``: counted by the frames' file names.
 - ``trackcraft/<label>/``: ``pts3d_ref.npy`` and ``scene_flow/<n>.npy`` in the world of ``da3``, counted by position.
 - ``sam3d*/<label>/cand_<i>_<stem>/``: ``mesh.glb`` and ``pose.json``; the mesh's frame goes to the camera by
   :func:`glb_to_camera`. ``registered_static/`` is in the mesh frame of its reference key frame.
@@ -26,6 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reconstruct.errors import TaaError
+from reconstruct.video import Video
 
 MODEL_FROM_GLB = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 PYTORCH3D_TO_RDF = np.diag([-1.0, -1.0, 1.0])
@@ -144,7 +145,8 @@ class ReleasedScene:
         n = len(data["frame_indices"])
         quaternion, shift = np.asarray(data["cam_quats_xyzw"], float), np.asarray(data["cam_trans"], float)
         if quaternion.shape != (n, 4) or shift.shape != (n, 3) or not n:
-            raise TaaError(f"{file}: cam_quats_xyzw {quaternion.shape} and cam_trans {shift.shape} do not fit {n} frames")
+            raise TaaError(f"{file}: cam_quats_xyzw {quaternion.shape} and cam_trans {shift.shape} do not fit {n} "
+                           "frames; make it again")  # fmt: skip
         T = np.tile(np.eye(4), (n, 1, 1))
         T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(quaternion).as_matrix(), shift
         intrinsics = data.get("intrinsics")
@@ -236,7 +238,7 @@ class ReleasedScene:
         return out[good] if good.any() else None
 
     def hand(self, name: str | None = None) -> tuple[HandFrames, str] | None:
-        """The hand seen in most frames, and the folder it is from: ``hawor_scaled`` before ``hawor`` before ``wilor``."""
+        """The hand seen in most frames, and its folder: ``hawor_scaled`` before ``hawor`` before ``wilor``."""
         for folder in (name,) if name else ("hawor_scaled", "hawor", "wilor"):
             files = sorted((self.folder / folder / "per_frame").glob("*.npz"))
             if files:
@@ -319,7 +321,8 @@ class ReleasedScene:
 
         reference = self._place.get(int(facts.get("reference_frame", -1)))
         if reference is None or not facts.get("static_geometry"):
-            raise TaaError(f"{file.parent}/metadata.json names no static geometry or no frame that is there; make it again")
+            raise TaaError(f"{file.parent}/metadata.json names no static geometry or no frame that is there; "
+                           "make it again")  # fmt: skip
         moving = {}
         for record in facts.get("frames", []):
             for part in record.get("moving_meshes") or []:
@@ -333,8 +336,8 @@ class ReleasedScene:
         for folder in ("pointtrack_joint", "simple_joint", "joints"):
             for label, joint in (self._json(f"{folder}/joints.json").get("joints") or {}).items():
                 if isinstance(joint, dict):
-                    found[f"{folder}/{label}"] = {k: joint.get(k) for k in ("type", "axis_direction", "axis_point",
-                                                                            "reference_frame", "state_unit")}  # fmt: skip
+                    keys = ("type", "axis_direction", "axis_point", "reference_frame", "state_unit")
+                    found[f"{folder}/{label}"] = {key: joint.get(key) for key in keys}
         return found
 
     def _json_file(self, file: Path) -> dict:
@@ -342,7 +345,7 @@ class ReleasedScene:
 
 
 def glb_to_camera(pose: Mapping[str, Any], where: object = "pose.json") -> np.ndarray:
-    """T_camera_glb (4, 4) of SAM 3D Objects' pose: mesh (y up) -> model (z up) -> PyTorch3D camera -> right, down, forward.
+    """T_camera_glb (4, 4) of SAM 3D Objects' pose: mesh (y up), model (z up), PyTorch3D camera, right-down-forward.
 
     Args:
         pose: ``rotation_quat_wxyz`` (PyTorch3D's, for row vectors), ``translation``, ``scale`` (one or three).
@@ -372,3 +375,66 @@ def camera_to_glb_pose(T_camera_glb: np.ndarray) -> dict[str, list[float]]:
     x, y, z, w = Rotation.from_matrix((linear / scale).T).as_quat()
     shift = PYTORCH3D_TO_RDF @ np.asarray(T_camera_glb, float)[:3, 3]
     return {"rotation_quat_wxyz": [w, x, y, z], "translation": shift.tolist(), "scale": [scale]}
+
+
+class ReleasedWriter:
+    """Writes what the released pipeline's scripts read, frames named ``NNNNNN`` from 0 without a gap.
+
+    Args:
+        folder: the scene; what is there of an earlier run is removed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        import shutil
+
+        self.folder = Path(folder)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+
+    def frames(self, video: Video) -> None:
+        """``frames/<n>.jpg`` of the working frames; all else refers to their pixels."""
+        import cv2
+
+        (self.folder / "frames").mkdir()
+        for t, frame in enumerate(video.frames):
+            cv2.imwrite(str(self.folder / "frames" / f"{t:06d}.jpg"), np.asarray(frame), [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+    def da3(self, video: Video, K: np.ndarray, T_world_camera: np.ndarray, depth: np.ndarray | None = None) -> None:
+        """``da3/`` from our cues, at working size.
+
+        Args:
+            K: (3, 3) or (T, 3, 3) full px.  T_world_camera: (T, 4, 4).
+            depth: (T, h, w) of any size, NaN where unknown.
+        """
+        import cv2
+
+        T, (h, w) = len(video), video.frames.shape[1:3]
+        small = np.array(np.broadcast_to(np.asarray(K, float), (T, 3, 3)))
+        for axis, s in ((0, w / video.size[0]), (1, h / video.size[1])):
+            small[:, axis, axis] *= s
+            small[:, axis, 2] = (small[:, axis, 2] + 0.5) * s - 0.5
+        folder = self.folder / "da3"
+        (folder / "depth").mkdir(parents=True)
+        index = np.arange(T, dtype=np.int32)
+        quaternion = Rotation.from_matrix(np.asarray(T_world_camera, float)[:, :3, :3]).as_quat()
+        np.savez(folder / "intrinsics.npz", frame_indices=index, intrinsics=small.astype(np.float32))
+        np.savez(folder / "cameras.npz", frame_indices=index, cam_quats_xyzw=quaternion.astype(np.float32),
+                 cam_trans=np.asarray(T_world_camera, float)[:, :3, 3].astype(np.float32),
+                 intrinsics=small.astype(np.float32))  # fmt: skip
+        for t in range(T if depth is not None else 0):
+            z = cv2.resize(np.asarray(depth[t], np.float32), (w, h), interpolation=cv2.INTER_NEAREST)
+            np.save(folder / "depth" / f"{t:06d}.npy", np.nan_to_num(z, nan=0.0))
+        facts = {"source": "taa", "ref_frame": 0, "start_idx": 0, "end_idx": T, "full_resolution_wh": [w, h]}
+        (folder / "config.json").write_text(json.dumps(facts), encoding="utf-8")
+
+    def masks(self, masks: Mapping[str, np.ndarray], motion: Mapping[str, str], keys: list[int]) -> None:
+        """``masks/``: label -> (T, h, w) bool; label -> "moving" or "static"; frames to reconstruct."""
+        import cv2
+
+        tracking = {}
+        for label, mask in masks.items():
+            (self.folder / "masks" / label).mkdir(parents=True)
+            for t, m in enumerate(mask):
+                cv2.imwrite(str(self.folder / "masks" / label / f"{t:06d}.png"), m.astype(np.uint8) * 255)
+            tracking[label] = {"motion": motion[label], "keyframe": keys[0], "keyframe_candidates": keys}
+        (self.folder / "masks" / "tracking.json").write_text(json.dumps(tracking), encoding="utf-8")

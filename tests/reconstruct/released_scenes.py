@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.providers.released import camera_to_glb_pose
 from reconstruct.synth import SynthTruth
+from reconstruct.synth.render import LINK_CODE
 
 SCALE = 0.37
 """Its lengths are its own: everything is shrunk by this."""
@@ -35,7 +36,7 @@ def source_cameras(truth: SynthTruth) -> np.ndarray:
 
 
 def write_released(truth: SynthTruth, folder: Path, parts: tuple[str, ...] = (), first: int = 0) -> Path:
-    """Write the parts asked for (all when none is named): frames, da3, masks, trackcraft, hawor, hawor_scaled, meshes."""
+    """Write the parts asked for, all when none is named."""
     import cv2
 
     every = ("frames", "da3", "masks", "trackcraft", "hawor", "hawor_scaled", "meshes", "joints")
@@ -60,7 +61,8 @@ def write_released(truth: SynthTruth, folder: Path, parts: tuple[str, ...] = (),
         for t in range(T):
             z = cv2.resize(truth.depth[t], (w, h), interpolation=cv2.INTER_NEAREST) * SCALE
             np.save(folder / "da3" / "depth" / f"{t:06d}.npy", np.nan_to_num(z).astype(np.float32))
-        (folder / "da3" / "config.json").write_text(json.dumps({"source": "da3", "da3_model": "depth-anything/DA3-BASE"}))
+        config = {"source": "da3", "da3_model": "depth-anything/DA3-BASE"}
+        (folder / "da3" / "config.json").write_text(json.dumps(config))
     if "masks" in parts:
         tracking = {}
         for part, label in LABELS.items():
@@ -75,9 +77,7 @@ def write_released(truth: SynthTruth, folder: Path, parts: tuple[str, ...] = (),
     if "trackcraft" in parts:
         xyz = truth.tracks["xyz_world"] @ S[:3, :3].T + S[:3, 3]
         window = list(range(0, T, 2))
-        for part, code in (("moving", 1), ("static", 0)):
-            from reconstruct.synth.render import LINK_CODE
-
+        for part in ("moving", "static"):
             own = (truth.tracks["link"] == LINK_CODE[part]) & truth.tracks["visible"][:, window[0]]
             target = folder / "trackcraft" / LABELS[part]
             (target / "scene_flow").mkdir(parents=True)

@@ -236,20 +236,3 @@ def test_frames_are_counted_by_name_and_by_place(imported):
     scene = ReleasedScene(source)
     assert scene.stems[0] == 1 and len(scene) == FRAMES
     assert sorted(scene.key_meshes()) == [0, FRAMES // 2]
-
-
-@pytest.mark.slow
-def test_fit_gives_the_joint_back_from_the_imported_scene(imported, truth, capfd):
-    """`taa import-scene`, then `taa fit`: the answer of the program itself, in the imported world."""
-    from taa_envs import cli
-
-    source, scene, facts = imported
-    code = cli.main(["import-scene", str(source), str(scene.parent / "again"), "--rate", "10", "--json"])
-    assert code == 0 and json.loads(capfd.readouterr().out)["cues"] == facts["cues"]
-    assert cli.main(["fit", str(scene.parent / "again"), "--json"]) == 0
-    joint = json.loads(capfd.readouterr().out)
-    S = to_scene(facts)
-    linear = S[:3, :3] / SCALE
-    turned, _ = axis_error(np.array(joint["axis"]), None, linear @ truth.axis, None, np.zeros(3))
-    assert joint["type"] == truth.type and turned < 2.0
-    assert np.ptp(joint["q"]) == pytest.approx(np.ptp(truth.q[:-1]), rel=0.15)

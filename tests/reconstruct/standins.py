@@ -1,0 +1,123 @@
+"""Stand-ins for models in environments of their own: scripts that read and write the files that the real ones document.
+
+Each script is run by the interpreter that the settings name, checks its input as the real one would, and answers from
+``truth.npz`` in its repository. ``mood`` in that folder makes it misbehave.
+"""
+
+from __future__ import annotations
+
+import stat
+import sys
+from pathlib import Path
+
+import numpy as np
+
+COMMON = '''
+import argparse, sys, time
+from pathlib import Path
+import numpy as np
+
+def mood(repository):
+    """What the test asks for: fine, fail, sleep, nothing, shapes, broken."""
+    file = Path(repository) / "mood"
+    word = file.read_text() if file.is_file() else "fine"
+    print("loading weights ...")
+    if word == "fail":
+        print("RuntimeError: CUDA error: no kernel image is available", file=sys.stderr)
+        sys.exit(3)
+    if word == "sleep":
+        time.sleep(60)
+    return word
+'''
+
+TRACKCRAFT = COMMON + '''
+p = argparse.ArgumentParser()
+for name in ("--checkpoint_path", "--input_npz", "--output_npz"):
+    p.add_argument(name, required=True)
+p.add_argument("--num_frames", type=int, default=12)
+p.add_argument("--frame_stride", type=int, default=5)
+a = p.parse_args()
+repository = Path(__file__).resolve().parents[1]
+word = mood(repository)
+assert Path(a.checkpoint_path).is_file()
+data = np.load(a.input_npz, allow_pickle=True)
+T = data["images_jpeg_bytes"].shape[0]
+span = a.num_frames * a.frame_stride
+if span > T:
+    sys.exit(f"need {span} frames but the NPZ only has {T}.")
+assert all(bytes(j[:2]) == b"\\xff\\xd8" for j in data["images_jpeg_bytes"])
+z, w2c, (fx, fy, cx, cy) = data["depth_map"], data["extrinsics_w2c"], data["fx_fy_cx_cy"]
+assert z.shape[0] == T and w2c.shape == (T, 4, 4) and np.allclose(w2c[0], np.eye(4), atol=1e-5)
+# Every pixel of the first frame: back-projected, then carried by its link as the simulator moves it.
+truth = np.load(repository / "truth.npz")
+h, w = 60, 104  # the network's own grid, stretched
+rows = ((np.arange(h) + 0.5) * z.shape[1] / h).astype(int)
+columns = ((np.arange(w) + 0.5) * z.shape[2] / w).astype(int)
+zz = z[0][np.ix_(rows, columns)]
+x = np.stack([(columns[None] - cx) / fx * zz, (rows[:, None] - cy) / fy * zz, zz], -1)
+reverse = "-1" in Path(a.input_npz).stem
+order = np.arange(len(truth["T_camera_world"]))[:: -1 if reverse else 1]
+frames = np.concatenate([order, np.full(max(0, span - len(order)), order[-1])])[:span:a.frame_stride]
+first = frames[0]
+link = truth["moving"][first]
+link = link[((np.arange(h) + 0.5) * link.shape[0] / h).astype(int)]
+link = link[:, ((np.arange(w) + 0.5) * link.shape[1] / w).astype(int)]
+camera, body = truth["T_camera_world"], truth["T_world_moving"]
+to_world = np.linalg.inv(camera[first])
+world = x @ to_world[:3, :3].T + to_world[:3, 3]
+out = []
+for t in frames:
+    M = camera[first] @ body[t] @ np.linalg.inv(body[first]) @ to_world
+    out.append(np.where(link[..., None], x @ M[:3, :3].T + M[:3, 3], x))
+out = np.stack(out).astype(np.float32)
+if word == "shapes":
+    out = out[:-1]
+if word == "broken":
+    Path(a.output_npz).write_bytes(b"PK nonsense")
+elif word != "nothing":
+    np.savez_compressed(a.output_npz, track_map=out, recon_map=out, rgb=np.zeros(out.shape, np.uint8))
+'''
+
+HANDS = COMMON + '''
+p = argparse.ArgumentParser()
+p.add_argument("--scene-dir", type=Path, required=True)
+p.add_argument("--hawor-repo", "--wilor-repo", dest="repo", type=Path, required=True)
+p.add_argument("--no-overlay", action="store_true")
+p.add_argument("--overwrite", action="store_true")
+a = p.parse_args()
+word = mood(a.repo)
+name = NAME
+geometry = a.scene_dir / ("da3/intrinsics.npz" if name == "hawor" else "any4d/moge/intrinsics.npz")
+frames = sorted((a.scene_dir / "frames").glob("*.jpg"))
+K = np.load(geometry)
+cameras = np.load(geometry.parents[0 if name == "hawor" else 1] / "cameras.npz")
+assert len(frames) == len(K["frame_indices"]) == len(cameras["cam_trans"])
+truth = np.load(a.repo / "truth.npz")
+out = a.scene_dir / name / "per_frame"
+out.mkdir(parents=True)
+for n, file in enumerate(frames):
+    if word == "nothing":
+        break
+    T = truth["T_camera_world"][n]
+    x = truth["hand_joints"][n] @ T[:3, :3].T + T[:3, 3]
+    x = 2.5 * x  # a monocular guess: too far and too large by the same factor
+    joints = x[None, :20] if word == "shapes" else x[None]
+    np.savez(out / f"{int(file.stem):06d}.npz", verts=np.repeat(x[None, :1], 778, axis=1), joints=joints,
+             is_right=np.array([str(truth["side"]) == "right"]), valid=np.array([n % 5 != 4]),
+             focal_length=np.float32(K["intrinsics"][n][0, 0]), frame_idx=np.int32(n))
+'''
+
+
+def environment(folder: Path, name: str, script: str, text: str, truth: dict[str, np.ndarray]) -> dict:
+    """A repository with one script, an interpreter and a checkpoint; its section of the settings."""
+    repository = folder / name
+    file = repository / script
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    np.savez(repository / "truth.npz", **truth)
+    python = folder / f"python-{name}"
+    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" -s "$@"\n')
+    python.chmod(python.stat().st_mode | stat.S_IXUSR)
+    (repository / "weights.safetensors").write_text("weights")
+    return {"python": str(python), "repository": str(repository), "checkpoint": str(repository / "weights.safetensors"),
+            "pipeline": str(repository)}  # fmt: skip
