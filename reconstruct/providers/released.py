@@ -303,7 +303,7 @@ class ReleasedScene:
         if not facts or not file.is_file():
             return None
         try:
-            scene = trimesh.load(file, force="scene", process=False)
+            scene: Any = trimesh.load(file, force="scene", process=False)
         except Exception as error:  # trimesh raises whatever its readers raise
             raise TaaError(f"cannot read the mesh {file} ({str(error)[:80]}); make it again") from error
 
