@@ -26,12 +26,12 @@ ROOT = Path(__file__).resolve().parent
 
 def _known() -> dict[str, type]:
     from reconstruct import cues
-    from reconstruct.geometry import Geometry, LinkMesh
+    from reconstruct.geometry import Geometry, LinkMesh, Skin
     from reconstruct.joint.models import JointFit
     from reconstruct.motion import CameraMotion
 
     types = (cues.ProviderInfo, cues.HandTrack, cues.Hands, cues.Tracks, cues.LinkMasks, cues.HandReference, JointFit,
-             LinkMesh, Geometry, CameraMotion)  # fmt: skip
+             LinkMesh, Skin, Geometry, CameraMotion)  # fmt: skip
     return {t.__name__: t for t in types}
 
 

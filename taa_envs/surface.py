@@ -10,7 +10,7 @@ import numpy as np
 
 from taa_envs.errors import AssetError
 
-MAX_FACES = 60_000
+MAX_FACES = 20_000
 COLOUR_STEP = 12  # grey levels within a face above which it is split, so that a coarse mesh keeps its picture
 MIN_EDGE_SHARE = 1 / 150  # of the mesh's size: smaller faces are never split
 SOLID_THICKNESS = 1e-5  # m; a collision part thinner than this is not a solid
@@ -20,6 +20,8 @@ class Link(Protocol):
     """A link's surface and collision parts; :class:`reconstruct.geometry.LinkMesh` is one.
 
     vertices: (V, 3) m.  faces: (F, 3).  colors: (V, 3) or (V, 4) uint8.  parts: convex (vertices (v, 3), faces (f, 3)).
+    An attribute ``skin``, where there is one, is what it looks like: vertices, faces, uv (F, 3, 2), normals (F, 3, 3)
+    and image (h, w, 3) uint8; without it each face takes the mean colour of its corners.
     """
 
     @property
@@ -62,26 +64,56 @@ def _refine(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> tup
 
 
 def write_textured_obj(folder: Path, name: str, link: Link) -> None:
-    """``name.obj`` and ``name.png``: MuJoCo has no vertex colours, so each face gets a texel of its own.
-
-    All three corners of a face name the centre of its texel: no seam, filter or mip level can mix faces.
+    """``name.obj`` and ``name.png``.
 
     Raises:
         AssetError: the link's arrays do not fit each other.
     """
     from PIL import Image
 
+    skin = getattr(link, "skin", None)
+    if skin is not None:
+        vertices, faces, uv, normals, image = _skin_arrays(skin)
+    else:
+        vertices, faces, uv, image = _texel_a_face(link)
+        normals = None
+    Image.fromarray(image).save(folder / f"{name}.png", optimize=True)
+    places, at = np.unique(np.round(uv.reshape(-1, 2), 5), axis=0, return_inverse=True)
+    lines = [f"v {x:.5g} {y:.5g} {z:.5g}" for x, y, z in vertices]
+    lines += [f"vt {u:.5f} {v:.5f}" for u, v in places]
+    corners = np.stack([faces.ravel() + 1, at.ravel() + 1], axis=1)
+    if normals is not None:
+        directions, toward = np.unique(np.round(normals.reshape(-1, 3), 3), axis=0, return_inverse=True)
+        lines += [f"vn {x:.3g} {y:.3g} {z:.3g}" for x, y, z in directions]
+        corners = np.column_stack([corners, toward.ravel() + 1])
+    words = ["/".join(str(i) for i in corner) for corner in corners]
+    lines += [f"f {words[i]} {words[i + 1]} {words[i + 2]}" for i in range(0, len(words), 3)]
+    (folder / f"{name}.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _skin_arrays(skin: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    vertices, faces = np.asarray(skin.vertices, float), np.asarray(skin.faces)
+    uv, normals, image = np.asarray(skin.uv, float), np.asarray(skin.normals, float), np.asarray(skin.image, np.uint8)
+    if uv.shape != (len(faces), 3, 2) or normals.shape != (len(faces), 3, 3) or image.ndim != 3 or image.shape[2] != 3:
+        raise AssetError(f"a skin needs uv (F, 3, 2), normals (F, 3, 3) and an image (h, w, 3), has {uv.shape}, "
+                         f"{normals.shape} and {image.shape}")
+    if not (np.isfinite(vertices).all() and np.isfinite(uv).all() and np.isfinite(normals).all()):
+        raise AssetError("a skin's vertices, uv and normals must be finite")
+    return vertices, faces, uv.clip(0, 1), normals, image
+
+
+def _texel_a_face(link: Link) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """MuJoCo has no vertex colours, so each face gets a texel of its own.
+
+    All three corners of a face name the centre of its texel: no seam, filter or mip level can mix faces.
+    """
     vertices, faces, colours = _refine(*_arrays(link))
     side = int(np.ceil(np.sqrt(len(faces))))
     atlas = np.zeros((side * side, 3), np.uint8)
     atlas[:len(faces)] = np.clip(np.rint(colours[faces].mean(axis=1)), 0, 255)
-    Image.fromarray(atlas.reshape(side, side, 3)).save(folder / f"{name}.png")
     column, row = np.arange(len(faces)) % side, np.arange(len(faces)) // side
     uv = np.stack([(column + 0.5) / side, 1 - (row + 0.5) / side], axis=1)
-    lines = [f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in vertices]
-    lines += [f"vt {u:.8f} {v:.8f}" for u, v in uv]
-    lines += [f"f {a}/{t} {b}/{t} {c}/{t}" for t, (a, b, c) in enumerate(faces + 1, start=1)]
-    (folder / f"{name}.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
+    return vertices, faces, np.repeat(uv[:, None], 3, axis=1), atlas.reshape(side, side, 3)
 
 
 def write_convex_part(path: Path, part: tuple[np.ndarray, np.ndarray]) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from reconstruct.cues import Hands, LinkMasks, Tracks
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
+from reconstruct.geometry.atlas import make_atlas
 from reconstruct.geometry.block import place_block
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
 from reconstruct.geometry.layers import frame_costs, spread_frames
@@ -16,7 +17,7 @@ from reconstruct.geometry.masks import points_on_mask
 from reconstruct.geometry.outline import build_shape
 from reconstruct.geometry.plane import fit_plane, keep_points
 from reconstruct.geometry.solids import carve, extrude, hull, swept_hulls, to_arrays
-from reconstruct.geometry.texture import paint, subdivide
+from reconstruct.geometry.texture import paint, subdivide, vertex_normals
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -138,7 +139,7 @@ def _hand_clouds(points: np.ndarray, clearance: float, count: int = 16) -> list[
 
 def _finish(video: Video, fit: JointFit, masks: LinkMasks, costs: np.ndarray, vertices: np.ndarray,
             faces: np.ndarray, parts: tuple, moves: bool, others: list, within: np.ndarray | None = None) -> LinkMesh:
-    """Subdivide and colour one link; ``within`` (any size) bounds the pixels that may colour it."""
+    """Colour one link and draw its picture; ``within`` (any size) bounds the pixels that may colour it."""
     import cv2
 
     fine_v, fine_f = subdivide(vertices, faces)
@@ -152,9 +153,14 @@ def _finish(video: Video, fit: JointFit, masks: LinkMasks, costs: np.ndarray, ve
         if within is not None:
             h, w = masks.moving.shape[1:]
             allowed &= cv2.resize(within.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)[None] > 0
-    colors, seen = paint(video, fit, fine_v, fine_f, frames, allowed, moves, [(vertices, faces, moves), *others])
+    hidden_by = [(vertices, faces, moves), *others]
+    colors, seen = paint(video, fit, fine_v, vertex_normals(fine_v, fine_f)[1], frames, allowed, moves, hidden_by)
+    depth = vertices @ fit.T_camera_world[2, :3] + fit.T_camera_world[2, 3]
+    pixels = fit.K[0, 0] * video.frames.shape[2] / video.size[0] / max(float(np.median(depth)), 1e-9)
+    atlas = make_atlas(vertices, faces, pixels)
+    texels, _ = paint(video, fit, atlas.points, atlas.directions, frames, allowed, moves, hidden_by)
     # Colours on the static block are a projection of what stands there; its surface itself stays assumed.
     assumed = ~seen[fine_f].all(1) if moves else np.ones(len(fine_f), bool)
-    return LinkMesh(fine_v, fine_f, colors, assumed, parts)
+    return LinkMesh(fine_v, fine_f, colors, assumed, parts, atlas.skin(texels[:, :3]))
 
 

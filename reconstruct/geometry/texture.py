@@ -8,6 +8,7 @@ from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
 TARGET_FACES = 4000
+REMAP = 30_000
 GREY = np.array([150.0, 150.0, 150.0])
 
 
@@ -31,34 +32,33 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     return unit(cross), unit(n)
 
 
-def paint(video: Video, fit: JointFit, vertices: np.ndarray, faces: np.ndarray, frames: np.ndarray,
+def paint(video: Video, fit: JointFit, points: np.ndarray, normals: np.ndarray, frames: np.ndarray,
           allowed: np.ndarray, moves: bool, depth_of: list[tuple[np.ndarray, np.ndarray, bool]]
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Colour each vertex from the frames that see it most squarely.
+    """Colour each point of a surface from the frames that see it most squarely.
 
     Args:
         video: stabilised.
-        vertices, faces: (V, 3), (F, 3) world, q = 0.
+        points, normals: (n, 3) world, q = 0; unit normals.
         frames: (F',) frames to take colours from.
         allowed: (F', h, w) bool, pixels that may be used in each.
         moves: whether this is the moving link.
-        depth_of: meshes (vertices, faces, moves) that can hide a vertex.
+        depth_of: meshes (vertices, faces, moves) that can hide a point.
 
     Returns:
-        colors (V, 4) uint8 RGBA and seen (V,) bool. Unseen vertices take the mean colour, darkened.
+        colors (n, 4) uint8 RGBA and seen (n,) bool. Unseen points take the colour of the nearest seen one, darkened.
     """
     import cv2
 
-    _, normals = vertex_normals(vertices, faces)
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
     camera = -fit.T_camera_world[:3, :3].T @ fit.T_camera_world[:3, 3]
-    best = np.zeros((3, len(vertices)))
-    colour = np.zeros((3, len(vertices), 3))
+    best = np.zeros((3, len(points)))
+    colour = np.zeros((3, len(points), 3))
     still = np.eye(4)
     for k, t in enumerate(frames):
         T = fit.link_pose(float(fit.q[t]))
         own = T if moves else still
-        x = vertices @ own[:3, :3].T + own[:3, 3]
+        x = points @ own[:3, :3].T + own[:3, 3]
         n = normals @ own[:3, :3].T
         to_camera = camera - x
         cosine = np.einsum("ij,ij->i", n, to_camera) / np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12)
@@ -70,8 +70,11 @@ def paint(video: Video, fit: JointFit, vertices: np.ndarray, faces: np.ndarray, 
         pc = px.clip(0, [w - 1, h - 1])
         ok &= allowed[k][pc[:, 1], pc[:, 0]]
         ok &= z <= _nearest(fit, video, depth_of, T, pc, (w, h)) + 0.03 * size
-        image = cv2.GaussianBlur(np.asarray(video.frames[t]), (0, 0), 1.0)
-        c = image[pc[:, 1], pc[:, 0]].astype(float)
+        at = np.nan_to_num(uv, nan=-9).clip(0, [w - 1, h - 1]).astype(np.float32)
+        c = np.empty((len(points), 3))
+        for i in range(0, len(points), REMAP):  # OpenCV maps no more columns at once
+            c[i : i + REMAP] = cv2.remap(video.frames[t], at[None, i : i + REMAP, 0], at[None, i : i + REMAP, 1],
+                                         cv2.INTER_LINEAR)[0]  # fmt: skip
         weight = np.where(ok, cosine**2 + 1e-3, 0.0)
         # Keep the three best views of each vertex, best first.
         for slot in range(3):
@@ -81,14 +84,18 @@ def paint(video: Video, fit: JointFit, vertices: np.ndarray, faces: np.ndarray, 
     seen = best[0] > 0
     # A view almost as good as the best may vote; the median drops a passing highlight.
     votes = np.where((best > 0.5 * best[0])[..., None] & (best > 0)[..., None], colour, np.nan)
-    out = np.tile(GREY * 0.6, (len(vertices), 1))
+    out = np.tile(GREY * 0.6, (len(points), 1))
     if seen.any():
         ordered = np.sort(votes[:, seen], axis=0)
         count = np.isfinite(ordered[..., 0]).sum(0)
         middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None, :, None] // 2, 0)[0]
         out[seen] = middle
-        out[~seen] = 0.6 * middle.mean(0)
-    rgba = np.full((len(vertices), 4), 255, np.uint8)
+        if not seen.all():
+            from scipy.spatial import cKDTree
+
+            # What was not seen is likely to go on as what was seen beside it, and stays darker to be told apart.
+            out[~seen] = 0.75 * middle[cKDTree(points[seen]).query(points[~seen])[1]]
+    rgba = np.full((len(points), 4), 255, np.uint8)
     rgba[:, :3] = np.clip(out[:, ::-1], 0, 255)
     return rgba, seen
 
