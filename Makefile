@@ -12,7 +12,7 @@ DEMO := demo
 export MUJOCO_GL ?= egl
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test check install lock clean
+.PHONY: demo test assets check install lock clean
 
 install: .venv/installed
 
@@ -37,6 +37,10 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest
+
+# The assets that ship, from clips that are rendered here; under an hour on two cores.
+assets: install
+	$(BIN)/python -m benchmarks.build_assets --work build/assets
 
 check: install
 	$(BIN)/ruff check .

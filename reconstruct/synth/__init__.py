@@ -8,9 +8,10 @@ from pathlib import Path
 
 from reconstruct.synth.animation import FRAME_RATE, animate
 from reconstruct.synth.clips import build_clip, list_clips
+from reconstruct.synth.staging import Clip
 from reconstruct.synth.truth import SynthTruth, load_truth, write_cues
 
-__all__ = ["SynthTruth", "list_clips", "load_truth", "render_clip", "render_clips", "write_cues"]
+__all__ = ["SynthTruth", "list_clips", "load_truth", "render_clip", "render_clips", "render_described", "write_cues"]
 
 DEFAULT_SIZE = (960, 540)
 
@@ -34,20 +35,26 @@ def render_clip(
         ValueError: unknown name, fewer than 8 frames, or an odd size.
         TaaError: no OpenGL without a display, or the video cannot be encoded.
     """
+    return render_described(build_clip(name, seed), out, seed, frames, size)
+
+
+def render_described(
+    clip: Clip, out: str | Path, seed: int = 0, frames: int | None = None, size: tuple[int, int] | None = None
+) -> Path:
+    """Render a clip that somebody else described, to ``out/<clip.name>``; see :func:`render_clip`."""
     from reconstruct.synth.encode import write_video
     from reconstruct.synth.render import render
     from reconstruct.synth.truth import write_truth
 
-    clip = build_clip(name, seed)
     count, (w, h) = frames or clip.frames, size or DEFAULT_SIZE
     if count < 8 or w % 2 or h % 2:
         raise ValueError(f"need at least 8 frames and an even size, not {count} frames of {w} x {h}")
     rate = FRAME_RATE * count / clip.frames
     motion = animate(clip, count, rate, seed)
     rendered = render(clip, motion, (w, h), seed)
-    folder = Path(out) / name
+    folder = Path(out) / clip.name
     # Written under another name first: a folder with the final name is always whole.
-    part = Path(out) / f".{name}.part"
+    part = Path(out) / f".{clip.name}.part"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     write_video(part / "video.mp4", rendered.image, rate)

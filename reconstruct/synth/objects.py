@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,17 +49,43 @@ class Box:
 
 
 @dataclass(frozen=True)
+class Solid:
+    """A textured mesh: what a :class:`Box` is, of any shape.
+
+    Attributes:
+        link: "room", "static" or "moving".
+        vertices, faces: (V, 3) m world, (F, 3).
+        paint: what covers it, laid on along the axis that each part of it looks along most.
+        density: texture px per metre.  shine: specular reflection in [0, 1].
+    """
+
+    link: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    paint: tx.Painter
+    density: float = 900.0
+    shine: float = 0.15
+
+    def moved(self, T: np.ndarray) -> Solid:
+        return replace(self, vertices=self.vertices @ T[:3, :3].T + T[:3, 3])
+
+    def corners(self) -> np.ndarray:
+        """(V, 3) world."""
+        return self.vertices
+
+
+@dataclass(frozen=True)
 class Model:
     """What is in the picture besides the hand.
 
     Attributes:
-        boxes: all boxes at q = 0.
+        boxes: all solids at q = 0.
         kind: "revolute", "prismatic" or None (no joint).
         axis, point: (3,) world, None as kind says.
         q_end: state when the hand lets go, rad or m.  q_range: the joint's stops.
     """
 
-    boxes: tuple[Box, ...]
+    boxes: tuple[Box | Solid, ...]
     kind: str | None
     axis: np.ndarray | None
     point: np.ndarray | None
@@ -84,8 +110,8 @@ def make_box(link: str, low: tuple, high: tuple, paint: tx.Painter, **kw) -> Box
     return Box(link, (low + high) / 2, high - low, paint, **kw)
 
 
-def opened(boxes: list[Box], kind: str, axis: np.ndarray, point: np.ndarray, q: float) -> list[Box]:
-    """The moving boxes turned by q: lets a model be written down in its closed state."""
+def opened(boxes: list, kind: str, axis: np.ndarray, point: np.ndarray, q: float) -> list:
+    """The moving solids turned by q: lets a model be written down in its closed state."""
     T = joint_transform(kind, axis, point, q)
     return [b.moved(T) if b.link == "moving" else b for b in boxes]
 

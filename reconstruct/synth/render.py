@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from reconstruct.errors import TaaError
 from reconstruct.synth.animation import Motion
 from reconstruct.synth.hand_model import HandMesh, build_hand
-from reconstruct.synth.objects import Box
+from reconstruct.synth.objects import Box, Solid
 from reconstruct.synth.staging import Clip
 
 LINK_CODE = {"none": 0, "room": 1, "static": 2, "moving": 3, "hand": 4}
@@ -88,6 +88,32 @@ def _box_mesh(box: Box, seed: int, detail: float) -> tuple[np.ndarray, np.ndarra
     return vertices, normals, np.concatenate(F), np.concatenate(U), atlas
 
 
+def _solid_mesh(solid: Solid, seed: int, detail: float) -> tuple[np.ndarray, ...]:
+    """Vertices, normals and texture coordinates, three a face, triangles and image of a solid of any shape."""
+    from reconstruct.geometry.atlas import make_atlas
+
+    rng, density = np.random.default_rng(seed), solid.density * detail
+    atlas = make_atlas(solid.vertices, solid.faces, density)
+    low, high = solid.vertices.min(0), solid.vertices.max(0)
+    side = np.abs(atlas.directions).argmax(1) * 2 + (atlas.directions[np.arange(len(atlas.points)),
+                                                     np.abs(atlas.directions).argmax(1)] > 0)  # fmt: skip
+    colours = np.zeros((len(atlas.points), 3), np.uint8)
+    for k in range(6):
+        axis, v_axis = k // 2, 2 if k // 2 != 2 else 1
+        u_axis = 3 - axis - v_axis
+        h, w = (max(4, round((high - low)[m] * density)) for m in (v_axis, u_axis))
+        picture = solid.paint(h, w, density, rng)
+        here = side == k
+        u, v = (((atlas.points[here] - low) / np.maximum(high - low, 1e-9))[:, m] for m in (u_axis, v_axis))
+        right = (k % 2 == 0) == (axis == 1)  # text runs the right way round when seen from outside
+        column = ((u if right else 1 - u) * (w - 1)).round().clip(0, w - 1).astype(int)
+        colours[here] = picture[((1 - v) * (h - 1)).round().clip(0, h - 1).astype(int), column]
+    skin = atlas.skin(colours)
+    index = np.arange(3 * len(solid.faces)).reshape(-1, 3)
+    uv = skin.uv.reshape(-1, 2) * [1, -1] + [0, 1]
+    return solid.vertices[solid.faces].reshape(-1, 3), skin.normals.reshape(-1, 3), index, uv, skin.image
+
+
 def _add_mesh(spec, body, name: str, V, N, F, U, FU, picture: np.ndarray, shine: float) -> None:
     import mujoco
 
@@ -143,8 +169,13 @@ def _scene(clip: Clip, hand: HandMesh, size: tuple[int, int], seed: int):
     for name in ("moving", "hand"):
         bodies[name] = spec.worldbody.add_body(name=name, mocap=True)
     for i, box in enumerate(clip.model.boxes):
-        V, N, F, U, atlas = _box_mesh(box, seed * 1000 + i, min(1.0, size[0] / 960))
-        _add_mesh(spec, bodies[box.link], f"{box.link}_{i}", V + box.centre, N, F, U, F, atlas, box.shine)
+        detail = min(1.0, size[0] / 960)
+        if isinstance(box, Solid):
+            V, N, F, U, atlas = _solid_mesh(box, seed * 1000 + i, detail)
+        else:
+            V, N, F, U, atlas = _box_mesh(box, seed * 1000 + i, detail)
+            V = V + box.centre
+        _add_mesh(spec, bodies[box.link], f"{box.link}_{i}", V, N, F, U, F, atlas, box.shine)
     quads, index = hand.quads, np.arange(4 * len(hand.quads)).reshape(-1, 4)
     F, FU = (np.concatenate([x[:, [0, 1, 2]], x[:, [0, 2, 3]]]) for x in (quads, index))
     _add_mesh(spec, bodies["hand"], "hand_0", hand.vertices, hand.normals, F, hand.texcoord, FU, hand.texture, 0.12)

@@ -11,7 +11,7 @@ import numpy as np
 from reconstruct.joint.models import joint_transform
 from reconstruct.synth.animation import Motion
 from reconstruct.synth.hand_model import landmarks
-from reconstruct.synth.objects import Model
+from reconstruct.synth.objects import Model, Solid
 from reconstruct.synth.render import LINK_CODE, Rendered
 from reconstruct.synth.staging import Clip
 
@@ -161,6 +161,11 @@ def write_mjcf(model: Model, path: Path) -> None:
     moving = (spec.worldbody if model.kind is None else static).add_body(name="moving")
     for i, box in enumerate(b for b in model.boxes if b.link != "room"):
         body = moving if box.link == "moving" else static
+        if isinstance(box, Solid):
+            mesh = spec.add_mesh(name=f"{box.link}_{i}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+            mesh.uservert, mesh.userface = box.vertices.ravel(), box.faces.astype(np.int32).ravel()
+            body.add_geom(name=mesh.name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, density=500)
+            continue
         body.add_geom(
             name=f"{box.link}_{i}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
