@@ -5,9 +5,8 @@
 
 Each object of furniture_sim is rendered with a hand (:mod:`benchmarks.furniture`), reconstructed from the video and
 compared: Chamfer distance (mean of both directions' mean nearest distances, outer surfaces) of the moving link at the
-first frame over its true diagonal, after the monocular scale is taken out, that is, along the camera's rays. Two columns
-say where the error is: with the joint and scale found (``pixels``), and with the true joint given to the geometry stage
-(``true joint``). A clip that fails is a row like any other.
+first frame over its true diagonal, after the monocular scale is taken out, that is, along the camera's rays. One more
+column has the same where the true joint is given to the geometry stage. A clip that fails is a row like any other.
 """
 
 from __future__ import annotations
@@ -178,7 +177,7 @@ def draw(truth, asset, file: Path, frames: int = 3) -> None:
 
 def table(rows: list[dict]) -> str:
     """Markdown, one line an object, failures with nothing but their words."""
-    out = ["| object | joint | axis | Chamfer / diagonal | found to true | true to found | with the true joint | thickness "
+    out = ["| object | joint | axis | Chamfer / diagonal | found to true | true to found | true joint | thickness "
            "| replay | |", "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
 
     def share(r: dict, key: str) -> str:
