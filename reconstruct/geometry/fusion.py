@@ -25,13 +25,13 @@ from reconstruct.errors import TaaError
 from reconstruct.geometry import LinkMesh
 from reconstruct.joint.models import JointFit
 
-SAMPLES = 6000
+SAMPLES = 4000
 """Surface points a mesh."""
 DEPTH_NOISE = 0.01
 """Standard deviation of a depth at 1 m, m; it grows with the square of the distance, as a disparity's does."""
 LATERAL_NOISE = 0.002
 """m at 1 m: half a pixel or so, across the ray."""
-GRID = 72
+GRID = 60
 """Cells along the longer side of the grid that a link is fused on."""
 
 
@@ -227,14 +227,19 @@ def _pixels(x: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def vote(cloud: Cloud, frame: int, frames: Sequence[int], fit: JointFit, masks: LinkMasks,
-         size: tuple[int, int], depths: np.ndarray | None) -> np.ndarray:  # fmt: skip
+         size: tuple[int, int], depths: np.ndarray | None, others: Sequence[tuple[int, Cloud]] = ()
+         ) -> np.ndarray:  # fmt: skip
     """(n,) share of votes for the moving link, 0.5 where nothing votes.
 
     Args:
         cloud: samples in the world, as they are in ``frame``.
         frames: key frames that vote.
         depths: (T, h, w) or None; with it, a point that something hides does not vote.
+        others: frame and samples, world, of the other meshes: as which link does a point lie on their surface too?
+            That decides for what no frame sees.
     """
+    from scipy.spatial import cKDTree
+
     q = np.asarray(fit.q, float)
     T_c = np.asarray(fit.T_camera_world, float)
     counts = np.zeros((2, len(cloud.points)))
@@ -258,6 +263,14 @@ def vote(cloud: Cloud, frame: int, frames: Sequence[int], fit: JointFit, masks: 
             ok = seen & ~hand
             # Being on the right mask speaks for a link; being on the other link's speaks against it.
             counts[int(moves)] += 1.0 * (ok & yes & ~no) - 1.0 * (ok & no & ~yes) - 1.0 * (floats & ~hand)
+    reach = 0.02 * float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
+    for t, other in others:
+        tree = cKDTree(other.points)
+        for moves in (False, True):
+            there = cloud.moved(fit.link_pose(q[t]) @ back if moves else np.eye(4))
+            distance, index = tree.query(there.points)
+            alike = np.einsum("ij,ij->i", there.normals, other.normals[index]).clip(0, 1)
+            counts[int(moves)] += alike * np.exp(-0.5 * (distance / reach) ** 2)
     difference = counts[1] - counts[0]
     raw = 1 / (1 + np.exp(-2.0 * np.clip(difference, -20, 20)))
     return _smooth(cloud, np.where(np.abs(difference) > 0, raw, 0.5))
@@ -280,7 +293,7 @@ def _smooth(cloud: Cloud, share: np.ndarray, rounds: int = 3, k: int = 12) -> np
     return out
 
 
-def register(own: np.ndarray, fixed: np.ndarray, camera: np.ndarray, steps: int = 25) -> tuple[np.ndarray, float]:
+def register(own: np.ndarray, fixed: np.ndarray, camera: np.ndarray, steps: int = 15) -> tuple[np.ndarray, float]:
     """(4, 4) similarity of one static part onto the others', and the median distance left.
 
     Iterated nearest points; the residual of a pair is wide along the ray from the camera (3,), and pairs beyond four
@@ -346,15 +359,17 @@ def fuse_meshes(keys: Sequence[KeyMesh], fit: JointFit, masks: LinkMasks, size: 
     labels = [np.zeros(SAMPLES, bool)] * len(keys)
     residual = np.full(len(keys), np.inf)
     for _ in range(2):
-        for k, cloud in enumerate(clouds):
-            labels[k] = vote(cloud.moved(poses[k]), frames[k], frames, fit, masks, size, depth) > 0.5
+        placed = [cloud.moved(pose) for cloud, pose in zip(clouds, poses, strict=True)]
+        for k in range(len(keys)):
+            others = [(frames[i], placed[i]) for i in np.flatnonzero(used) if i != k]
+            labels[k] = vote(placed[k], frames[k], frames, fit, masks, size, depth, others) > 0.5
         for k in np.flatnonzero(used):
-            others = [clouds[i].moved(poses[i]).points[~labels[i]] for i in np.flatnonzero(used) if i != k]
+            rest = [clouds[i].moved(poses[i]).points[~labels[i]] for i in np.flatnonzero(used) if i != k]
             own = clouds[k].moved(poses[k]).points[~labels[k]]
-            if not others or len(own) < 50 or sum(map(len, others)) < 50:
-                residual[k] = 0.0 if not others else np.inf
+            if not rest or len(own) < 50 or sum(map(len, rest)) < 50:
+                residual[k] = 0.0 if not rest else np.inf
                 continue
-            S, residual[k] = register(own, np.concatenate(others), camera)
+            S, residual[k] = register(own, np.concatenate(rest), camera)
             poses[k] = S @ poses[k]
         middle = float(np.median(residual[used]))
         used &= residual <= max(3 * middle, 1e-9)
@@ -413,7 +428,7 @@ def _fuse_link(observations: list[tuple[Cloud, np.ndarray]]) -> LinkMesh:
     from reconstruct.geometry.solids import from_arrays, to_arrays
 
     # Contact needs no more than a cell's precision, and the decomposition's time grows with the faces.
-    plain = to_arrays(from_arrays(vertices, faces).simplify(cell))
+    plain = to_arrays(from_arrays(vertices, faces).simplify(1.2 * cell))
     return LinkMesh(vertices, faces, rgba, far, bounded_parts(*plain))
 
 

@@ -183,6 +183,73 @@ def _box(seed: int) -> Clip:
     )
 
 
+def _locker(seed: int) -> Clip:
+    model = objects.locker(seed)
+    pose = HandPose(
+        flex=((14, 16, 10), (14, 16, 10), (14, 16, 10), (16, 18, 10)),
+        spread=(12, 1, -9, -21),
+        thumb=(50, 14, 12, 10),
+        wrist=(46, 0),
+    )
+    out = np.array([0.0, -1, 0])
+    T = place_hand(
+        pose,
+        "left",
+        -out,
+        np.array([0.28, 0.14, 0.95]),
+        np.array([-0.075, 0, 0.60]),
+        (12,),
+        (np.array([0, -0.020, 0.0]), out),
+        ANY_JOINT,
+    )
+    opened = model.link_pose(np.radians(-80.0))
+    turn = opened[:3, :3]
+    return Clip(
+        "locker",
+        "a tall cabinet's door is pushed shut with the left hand",
+        model,
+        pose,
+        "left",
+        opened @ T,
+        turn @ np.array([-0.06, -0.20, -0.16]),
+        turn @ np.array([0.0, -0.10, 0.0]),
+        np.array([0.56, -0.90, 0.70]),
+        np.array([0.02, -0.06, 0.53]),
+    )
+
+
+def _crate(seed: int) -> Clip:
+    model = objects.crate(seed)
+    pose = HandPose(
+        flex=((14, 18, 10), (14, 18, 10), (14, 18, 10), (14, 18, 10)),
+        spread=(8, 1, -6, -14),
+        thumb=(60, 4, 8, 8),
+        wrist=(14, 0),
+    )
+    T = place_hand(
+        pose,
+        "right",
+        np.array([0, -0.20, -0.98]),
+        np.array([-0.12, 0.97, -0.20]),
+        np.array([0.010, 0.05, 0.176]),
+        (8, 12, 16),
+        (np.array([0, 0.060, 0.0]), np.array([0.0, -1, 0])),
+        (8, 12, 16, 20),
+    )
+    return Clip(
+        "crate",
+        "a crate's lid is slid open",
+        model,
+        pose,
+        "right",
+        T,
+        np.array([0.06, -0.18, 0.10]),
+        np.array([0.0, -0.05, 0.06]),
+        np.array([-0.48, -0.34, 0.66]),
+        np.array([0.01, 0.12, 0.15]),
+    )
+
+
 def _still(seed: int) -> Clip:
     clip = _drawer(seed)
     pose = HandPose(wrist=(55, 0))
@@ -219,6 +286,8 @@ _BUILDERS: dict[str, Callable[[int], Clip]] = {
     "puncher": desk_clips.puncher,
     "cabinet": _cabinet,
     "box": _box,
+    "locker": _locker,
+    "crate": _crate,
     "lift": desk_clips.lift,
     "still": _still,
     "demo_handheld": _demo_handheld,

@@ -180,6 +180,47 @@ def cupboard(seed: int) -> Model:
     )
 
 
+def locker(seed: int) -> Model:
+    """A tall wall cabinet, hinged at the right, whose door stands open by 80 deg and is pushed shut to 6 deg."""
+    body = tx.paint((0.50, 0.56, 0.58), 0.04)
+    front = tx.with_stickers(tx.wood((0.60, 0.52, 0.40), 0.20, upright=True), 8, 0.06)
+    boxes = room(seed, 0.22) + _cabinet((-0.17, 0.0, 0.30), (0.17, 0.22, 0.78), 0.016, body, shelves=2)
+    boxes.append(make_box("moving", (-0.168, -0.020, 0.302), (0.17, -0.002, 0.778), front, density=1400))
+    knob = tx.paint((0.22, 0.22, 0.24))
+    boxes.append(make_box("moving", (-0.145, -0.036, 0.70), (-0.13, -0.020, 0.74), knob, shine=0.6))
+    for k, colour in enumerate(((0.70, 0.40, 0.25), (0.35, 0.45, 0.60), (0.75, 0.70, 0.40))):
+        tin = tx.with_stickers(tx.paint(colour, 0.05), 1, 0.04)
+        low = (-0.13 + 0.09 * k, 0.08, 0.316)
+        boxes.append(make_box("static", low, (low[0] + 0.06, 0.14, low[2] + 0.10), tin))
+    # Shutting a door that is hinged at the right turns it about -z.
+    axis, point, start = np.array([0.0, 0, -1]), np.array([0.17, -0.002, 0.54]), np.radians(-80.0)
+    boxes = opened(boxes, "revolute", axis, point, start)
+    return Model(tuple(boxes), "revolute", axis, point, np.radians(74.0), (0.0, np.radians(80.0)))
+
+
+def crate(seed: int) -> Model:
+    """A crate whose lid slides away from the viewer by 16 cm, pushed at a rib near its front edge."""
+    side = tx.with_stickers(tx.wood((0.50, 0.36, 0.22), 0.16), 3, 0.05)
+    inner = tx.paint((0.60, 0.55, 0.46), 0.03)
+    top = tx.with_stickers(tx.wood((0.62, 0.48, 0.32), 0.20), 8, 0.05)
+    w, d, h, wall = 0.15, 0.28, 0.16, 0.012
+    boxes = room(seed, 0.60) + [
+        make_box("static", (-w, 0.0, 0.0), (w, wall, h), side),
+        make_box("static", (-w, d - wall, 0.0), (w, d, h - 0.018), side),
+        make_box("static", (-w, wall, 0.0), (-w + wall, d - wall, h), side),
+        make_box("static", (w - wall, wall, 0.0), (w, d - wall, h), side),
+        make_box("static", (-w + wall, wall, 0.0), (w - wall, d - wall, wall), inner),
+    ]
+    for k, colour in enumerate(((0.75, 0.35, 0.30), (0.30, 0.45, 0.60))):
+        packet = tx.with_stickers(tx.paint(colour, 0.05), 2, 0.03)
+        boxes.append(make_box("static", (-0.10 + 0.11 * k, 0.03, wall), (-0.01 + 0.11 * k, 0.12, 0.09), packet))
+    x = w - wall - 0.001
+    boxes.append(make_box("moving", (-x, wall + 0.002, h - 0.014), (x, d - 0.001, h - 0.002), top, density=1500))
+    rib = tx.paint((0.26, 0.24, 0.22), 0.04)
+    boxes.append(make_box("moving", (-0.07, 0.060, h - 0.002), (0.07, 0.074, h + 0.030), rib, shine=0.3))
+    return Model(tuple(boxes), "prismatic", np.array([0.0, 1, 0]), None, 0.16, (0.0, 0.20))
+
+
 def drawers(seed: int) -> Model:
     """A chest whose upper drawer is pulled out by 18 cm at its plate handle."""
     body = tx.wood((0.44, 0.30, 0.20), 0.16)
