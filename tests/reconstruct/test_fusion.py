@@ -70,7 +70,8 @@ def scene():
     return fit, masks, depth
 
 
-def key_mesh(fit: JointFit, frame: int, seed: int, scale: float = 0.15, wrong: bool = False) -> KeyMesh:
+def key_mesh(fit: JointFit, frame: int, seed: int, scale: float = 0.15, wrong: bool = False,
+             exact: bool = False) -> KeyMesh:  # fmt: skip
     """What a network would give: the object as it is in the frame, scaled, turned, shifted, rough."""
     rng = np.random.default_rng(seed)
     parts = []
@@ -83,6 +84,8 @@ def key_mesh(fit: JointFit, frame: int, seed: int, scale: float = 0.15, wrong: b
             mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
             parts.append(mesh)
     mesh = trimesh.util.concatenate(parts)
+    if exact:
+        return KeyMesh(frame, np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.visual.vertex_colors))
     vertices = mesh.vertices + rng.normal(0, 0.0015, mesh.vertices.shape)
     middle = vertices.mean(0)
     turn = Rotation.from_rotvec(np.radians(3.0) * rng.normal(size=3) / np.sqrt(3)).as_matrix()
@@ -135,10 +138,10 @@ def test_ground_finds_the_scale_along_the_ray(scene):
     shrunk = replace(key, vertices=key.vertices * 0.7)
     S = ground(sample(shrunk), depth[3], fit.K, SIZE)
     assert np.cbrt(np.linalg.det(S[:3, :3])) == pytest.approx(1 / 0.7, rel=0.03)
-    truth = np.concatenate([m.apply_transform(fit.T_camera_world @ (fit.link_pose(fit.q[3]) if moves else np.eye(4))
-                                              ).vertices for moves in (False, True) for m in boxes(moves)])  # fmt: skip
     moved = shrunk.vertices @ S[:3, :3].T + S[:3, 3]
-    assert np.linalg.norm(moved.mean(0) - truth.mean(0)) < 0.06
+    truth = key_mesh(fit, 3, seed=1, exact=True).vertices
+    assert np.median(np.linalg.norm(moved - truth, axis=1)) < 0.02
+    assert np.median(np.linalg.norm(shrunk.vertices - truth, axis=1)) > 0.3
 
 
 def test_without_depth_the_meshes_own_place_counts_and_a_missing_link_is_named(scene):
@@ -183,6 +186,6 @@ def test_the_zero_level_is_a_closed_sphere():
     x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
     vertices, faces = zero_level(1.0 - np.linalg.norm(x, axis=-1), np.full(3, -1.2), 0.1)
     mesh = trimesh.Trimesh(vertices, faces)
-    assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
     with pytest.raises(TaaError, match="agree on any solid"):
         zero_level(np.full((5, 5, 5), -1.0), np.zeros(3), 0.1)
