@@ -205,6 +205,8 @@ class Train(Common):
     """Algorithm; its settings are in train/configs."""
     steps: int | None = None
     """Environment steps in all (default: as the settings say)."""
+    minutes: float | None = None
+    """Stop after so many by the clock; the same command goes on."""
     envs: int | None = None
     """Simulations at once (default: as the settings say)."""
     config: Path | None = None
@@ -215,7 +217,7 @@ class Train(Common):
     """Seed of everything that draws."""
 
     def run(self) -> Outcome:
-        return commands.train(self.id, self.algo, self.steps, self.envs, self.config, self.out, self.seed)
+        return commands.train(self.id, self.algo, self.steps, self.envs, self.config, self.out, self.seed, self.minutes)
 
 
 @dataclass(kw_only=True)

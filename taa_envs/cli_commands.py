@@ -457,7 +457,7 @@ def _licences(provider: dict) -> str:
 
 
 def train(asset_id: str, algo: str, steps: int | None, envs: int | None, config: Path | None, out: Path | None,
-          seed: int) -> Outcome:  # fmt: skip
+          seed: int, minutes: float | None) -> Outcome:  # fmt: skip
     from taa_envs import registry
 
     asset = registry.get_asset(asset_id)
@@ -475,7 +475,7 @@ def train(asset_id: str, algo: str, steps: int | None, envs: int | None, config:
             last.update(row)
             bars.update(share)
 
-        data = run(asset, settings, folder, progress=progress)
+        data = run(asset, settings, folder, minutes=minutes, progress=progress)
         known = last and np.isfinite(last["success"])
         bars.finish(time.monotonic() - begin, f"success {last['success']:.0%} with exploration" if known else "")
 

@@ -37,7 +37,7 @@ from train.policy import CLASSES, arrays, load_torch, save_policy, save_torch, t
 from train.vec import BatchedVecEnv, Normal, replay_normal
 
 FORMAT = "taa-checkpoint/1"
-COLUMNS = ("steps", "episodes", "success", "return", "progress", "seconds")
+COLUMNS = ("steps", "episodes", "success", "return", "progress", "seconds", "processor")
 WINDOW = 100  # episodes that a row of the curve averages over
 CHUNK = 2048  # environment steps between rows of SAC's curve; PPO has one a rollout
 
@@ -61,17 +61,20 @@ class _Episodes(BaseCallback):
         return np.mean(self.last, axis=0).tolist() if self.last else [float("nan")] * 3
 
 
-def train(asset: Asset, config: Config, folder: Path, *, progress: Callable[[float, dict], None] | None = None) -> dict:
+def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None = None,
+          progress: Callable[[float, dict], None] | None = None) -> dict:
     """Train a policy, or go on with a run that was begun with the same settings.
 
     Args:
         asset: what to train on.
         config: settings.  ``steps`` may be larger than the run's was: it then goes on.
         folder: the run's, made if missing.
+        minutes: stop after so many by the clock, those before a kill counted in; the run can go on later.
         progress: called after every iteration with the share done and the curve's row.
 
     Returns:
-        run (path), policy (path), resumed_at (steps), steps, and the curve's last success, return and progress.
+        run (path), policy (path), resumed_at (steps), steps, and the curve's last success, return, progress,
+        seconds by the clock and of the processor.
 
     Raises:
         TaaEnvsError: the folder holds a run with other settings, or something else.
@@ -100,22 +103,25 @@ def train(asset: Asset, config: Config, folder: Path, *, progress: Callable[[flo
             model.policy.action_net.weight.zero_()
     episodes, rows = _Episodes(), []
     chunk = config.envs * model.n_steps if config.algo == "ppo" else max(CHUNK // config.hold, config.envs)
-    resumed, seconds = 0, 0.0
+    resumed, seconds, used = 0, 0.0, 0.0
     if content is not None:
         rows = _restore(model, env, episodes, content)
-        resumed, seconds = model.num_timesteps * config.hold, rows[-1][-1] if rows else 0.0
-    begin, saved, made = time.monotonic() - seconds, resumed, resumed
-    while made < config.steps:
+        resumed, (seconds, used) = model.num_timesteps * config.hold, rows[-1][-2:] if rows else (0.0, 0.0)
+    begin, begin_used, saved, made = time.monotonic() - seconds, time.process_time() - used, resumed, resumed
+    over = made >= config.steps
+    while not over:
         # The first call resets the environments, the others go on.
         model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
         made = model.num_timesteps * config.hold  # Stable-Baselines3 counts decisions
-        rows.append([made, episodes.count, *episodes.means(), time.monotonic() - begin])
+        rows.append([made, episodes.count, *episodes.means(), time.monotonic() - begin,
+                     time.process_time() - begin_used])
         for name, value in zip(COLUMNS[1:], rows[-1][1:], strict=True):
             model.logger.record(f"taa/{name}", value)
         model.logger.dump(made)
         if progress is not None:
             progress(min(made / config.steps, 1.0), dict(zip(COLUMNS, rows[-1], strict=True)))
-        if made - saved >= config.checkpoint_every or made >= config.steps:
+        over = made >= config.steps or (minutes is not None and time.monotonic() - begin >= 60 * minutes)
+        if made - saved >= config.checkpoint_every or over:
             save_torch(checkpoint, _checkpoint(model, env, normal, episodes, rows))
             save_policy(folder / "policy.pt", model.policy, normal, config, asset.id)
             _write_curve(folder / "curve.csv", rows)
@@ -124,7 +130,7 @@ def train(asset: Asset, config: Config, folder: Path, *, progress: Callable[[flo
     last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
     return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
             "steps": made,
-            **{k: None if np.isnan(last[k]) else last[k] for k in ("success", "return", "progress") if k in last}}
+            **{k: None if np.isnan(last[k]) else last[k] for k in COLUMNS[2:] if k in last}}
 
 
 def _claim(folder: Path, described: dict) -> None:

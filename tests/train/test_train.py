@@ -34,9 +34,9 @@ class Killed(Exception):
 
 
 def curve(folder: Path) -> list[list[str]]:
-    """Without the column of seconds."""
+    """Without the columns of seconds."""
     with (folder / "curve.csv").open(newline="", encoding="utf-8") as f:
-        return [row[:-1] for row in csv.reader(f)]
+        return [row[:-2] for row in csv.reader(f)]
 
 
 @pytest.mark.parametrize("config", [PPO, SAC], ids=["ppo", "sac"])
@@ -58,6 +58,13 @@ def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp
     assert curve(tmp_path / "killed") == curve(tmp_path / "whole") and len(curve(tmp_path / "whole")) > 3
     a, b = (load_policy(tmp_path / name)[0].network.state_dict() for name in ("whole", "killed"))
     assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_a_run_stops_by_the_clock_and_goes_on(door: Asset, tmp_path: Path) -> None:
+    stopped = train(door, PPO, tmp_path / "run", minutes=1e-6)
+    assert stopped["steps"] == 256 and (tmp_path / "run" / "policy.pt").is_file()  # one iteration
+    done = train(door, PPO, tmp_path / "run")
+    assert done["resumed_at"] == 256 and done["steps"] == PPO.steps and done["seconds"] > stopped["seconds"]
 
 
 def test_a_folder_holds_one_run(door: Asset, tmp_path: Path) -> None:

@@ -1,0 +1,161 @@
+"""A table of policies: each asset, several seeds, so many minutes each, beside the open-loop replay.
+
+    python -m train.zoo                                   # every shipped asset
+    python -m train.zoo ID ... --seeds 0 1 2 --minutes 15 --out runs/zoo --page docs/zoo.md
+
+What is done stays done: a run that was killed goes on, and finished evaluations are read, not made again. A training
+run is allowed so many minutes by the clock of a machine on which nothing else is to run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from taa_envs.asset import Asset
+from taa_envs.files import written_whole
+from taa_envs.registry import find_assets, get_asset, shipped_folder
+from train.config import load_config
+from train.evaluate import evaluate
+from train.run import train
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One asset's row. runs: an evaluation (:func:`train.evaluate.evaluate`) a seed, with ``trained`` beside it."""
+
+    asset: Asset
+    runs: list[dict[str, Any]]
+    curves: list[Path]
+
+    def pooled(self, who: str) -> tuple[float, float, float]:
+        """Success over all seeds' episodes of "policy", or the replay's, with its 95 % Wilson interval."""
+        runs = self.runs if who == "policy" else self.runs[:1]  # every seed is compared in the same episodes
+        count = sum(run["episodes"] for run in runs)
+        wins = sum(round(run[who]["success"] * run["episodes"]) for run in runs)
+        interval = binomtest(wins, count).proportion_ci(0.95, method="wilson")
+        return wins / count, float(interval.low), float(interval.high)
+
+
+def make(asset: Asset, algo: str, seeds: Sequence[int], minutes: float, steps: int | None, episodes: int, out: Path
+         ) -> Entry:
+    """Train and evaluate what is not there yet."""
+    runs, curves = [], []
+    for seed in seeds:
+        folder = out / f"{asset.id}-{algo}-{seed}"
+        file = folder / "zoo.json"
+        wanted = {"minutes": minutes, "steps": steps, "episodes": episodes}
+        known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        if known.get("wanted") != wanted:
+            trained = train(asset, load_config(algo, seed=seed, steps=steps), folder, minutes=minutes)
+            known = {"wanted": wanted, "trained": trained, **evaluate(asset, folder, episodes)}
+            with written_whole(file) as partial:
+                partial.write_text(json.dumps(known, indent=1), encoding="utf-8")
+        runs.append(known)
+        curves.append(folder / "curve.csv")
+        print(f"{asset.id} seed {seed}: {known['policy']['success']:.0%}, replay {known['replay']['success']:.0%}, "
+              f"{known['trained']['steps']} steps in {known['trained']['seconds']:.0f} s", flush=True)
+    return Entry(asset, runs, curves)
+
+
+def table(entries: Sequence[Entry]) -> str:
+    """Markdown."""
+    rows = ["| asset | joint | replay | policy, all seeds | each seed | gain | steps | minutes | processor minutes |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"]
+    for entry in entries:
+        (replay, *around), (policy, *about) = entry.pooled("replay"), entry.pooled("policy")
+        trained = [run["trained"] for run in entry.runs]
+        rows.append(
+            f"| {entry.asset.id} | {entry.asset.joint_type} | {replay:.0%} ({around[0]:.0%} to {around[1]:.0%}) | "
+            f"**{policy:.0%}** ({about[0]:.0%} to {about[1]:.0%}) | "
+            + ", ".join(f"{run['policy']['success']:.0%}" for run in entry.runs)
+            + f" | {100 * (policy - replay):+.0f} | {np.mean([t['steps'] for t in trained]) / 1000:.0f} k | "
+            f"{np.mean([t['seconds'] for t in trained]) / 60:.1f} | "
+            f"{np.mean([t['processor'] for t in trained]) / 60:.1f} |")
+    return "\n".join(rows)
+
+
+def page(entries: Sequence[Entry], command: str, figure: str | None) -> str:
+    """Markdown page around the table."""
+    run = entries[0].runs[0]
+    lines = ["# Policy zoo", "",
+             f"`{command}` trains and evaluates all of it (settings: `train/configs`). Success in {run['episodes']} "
+             "episodes a seed under each asset's own randomisation, none of them seen in training, with 95 % Wilson "
+             "intervals; the replay runs in the same episodes. Interval and mean over all seeds do not say how seeds "
+             f"differ: their own column does. {platform.processor() or platform.machine()}, MuJoCo and "
+             "Stable-Baselines3 of the lock file.", "", table(entries), ""]
+    if figure is not None:
+        lines += [f"![Success in training over environment steps, a line a seed.]({figure})", "",
+                  "*With the noise that training explores with, over the last 100 episodes.*", ""]
+    return "\n".join(lines)
+
+
+def draw(file: Path, entries: Sequence[Entry]) -> None:
+    """Curves of every run, a panel an asset."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    columns = min(3, len(entries))
+    rows = -(-len(entries) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(3.2 * columns, 2.4 * rows), squeeze=False, sharey=True,
+                                layout="constrained")
+    for ax, entry in zip(axes.flat, entries, strict=False):
+        for curve in entry.curves:
+            with curve.open(newline="", encoding="utf-8") as f:
+                points = [(float(r["steps"]) / 1000, float(r["success"])) for r in csv.DictReader(f)]
+            ax.plot(*zip(*points, strict=True), linewidth=1)
+        ax.axhline(entry.pooled("replay")[0], color="0.4", linestyle="--", linewidth=1)
+        ax.set_title(entry.asset.id, fontsize=9)
+        ax.set_ylim(0, 1)
+        ax.set_xlabel("thousand steps", fontsize=8)
+        ax.tick_params(labelsize=8)
+    for ax in list(axes.flat)[len(entries):]:
+        ax.axis("off")
+    axes[0, 0].set_ylabel("success (dashed: replay)", fontsize=8)
+    figure.savefig(file, dpi=140)
+    plt.close(figure)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("ids", nargs="*", help="assets (default: all that ship)")
+    parser.add_argument("--algo", default="ppo", choices=["ppo", "sac"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--minutes", type=float, default=15.0, help="by the clock, of training a seed")
+    parser.add_argument("--steps", type=int, help="environment steps of training at most (default: the settings')")
+    parser.add_argument("--episodes", type=int, default=100, help="of evaluation a seed")
+    parser.add_argument("--out", type=Path, default=Path("runs/zoo"))
+    parser.add_argument("--page", type=Path, help="Markdown file to write; the figure goes to images/zoo.png beside it")
+    arguments = parser.parse_args(argv)
+    shipped = shipped_folder().resolve()
+    ids = arguments.ids or [i for i, folder in sorted(find_assets().items()) if folder.resolve().parent == shipped]
+    if not ids:
+        parser.error("no asset ships with this version; name some")
+    entries = [make(get_asset(i), arguments.algo, arguments.seeds, arguments.minutes, arguments.steps,
+                    arguments.episodes, arguments.out) for i in ids]
+    print(table(entries))
+    if arguments.page is not None:
+        figure = arguments.page.parent / "images" / "zoo.png"
+        figure.parent.mkdir(parents=True, exist_ok=True)
+        draw(figure, entries)
+        command = "python -m train.zoo " + " ".join(
+            [*arguments.ids, f"--algo {arguments.algo}", "--seeds", *map(str, arguments.seeds),
+             f"--minutes {arguments.minutes:g}", f"--episodes {arguments.episodes}"]
+            + ([f"--steps {arguments.steps}"] if arguments.steps else []))
+        with written_whole(arguments.page) as partial:
+            partial.write_text(page(entries, command, "images/zoo.png"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
