@@ -11,9 +11,13 @@ CONTACT = np.array([3, 4, 7, 8, 11, 12, 15, 16, 19, 20])
 """Finger tips and the joints before them: what usually touches."""
 ADULT_SIZE_STD = 0.07
 """Relative spread of adult hand sizes."""
-HAND_SIZE_STD = 0.15
-"""Relative error of every length that rests on a hand: adult hand sizes spread by 7 %, the network's finger directions
-add 13 % (rendered clips with a known hand: depth off by -20 to +16 %)."""
+HAND_SIZE_STD = 0.09
+"""Relative error of every length that rests on a hand: adult hand sizes spread by 7 %, landmarks on the palm add 5 %
+(rendered clips, true palm: depth off by -2 to +10 %)."""
+PALM = (0, 5, 9, 13, 17)
+PALM_SHAPE = np.array([[0.0, 0.0, 0.0], [0.023, 0.085, 0.0], [0.0, 0.087, 0.0], [-0.020, 0.080, 0.0],
+                       [-0.038, 0.068, 0.0]])  # fmt: skip
+"""(5, 3) m, wrist and knuckles of a mean adult's right hand: x to the thumb's side, y along the middle metacarpal."""
 ADULT = np.array([0.0, 0.033, 0.041, 0.032, 0.026, 0.088, 0.040, 0.024, 0.021, 0.087, 0.045, 0.028, 0.022, 0.082,
                   0.041, 0.026, 0.022, 0.078, 0.032, 0.020, 0.019])  # fmt: skip
 """(21,) m from each landmark to its parent in a mean adult hand (wrist to middle finger tip 0.18 m).
