@@ -1,4 +1,4 @@
-"""How far the demonstrated hand moves the passive joint by contact alone: the replay ladder over rendered and real clips.
+"""How far the demonstrated hand moves the passive joint by contact alone, over rendered and real clips.
 
     python -m benchmarks.replay                              # all clips, with refinement
     python -m benchmarks.replay --only drawer oven --cues given --keep work
