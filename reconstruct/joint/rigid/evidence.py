@@ -1,0 +1,124 @@
+"""Which joint: nested models of one family, judged by frames that did not take part in the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruct.joint.rigid.bundle import OWN, Normal, State, normal_equations, reduced, refine, residuals, weigh
+from reconstruct.joint.rigid.observe import Noise, Observations
+from reconstruct.joint.rigid.twist import KINDS
+
+PRIOR = {"prismatic": 0.45, "revolute": 0.45, "screw": 0.10}
+TURN_PRIOR = 1.0
+"""Total rotation of a hinge, rad: standard deviation of the prior in each of the two directions across the motion."""
+PITCH_PRIOR = 0.3
+"""Shift along the axis over a screw's stroke, in sizes of the link."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Per type.
+
+    Attributes:
+        probability: after calibration.
+        heldout: half the squared residuals of held-out frames, corrected for correlated errors; lower is better.
+        occam: logarithm of the prior's over the posterior's width in the parameters beyond a slide's.
+    """
+
+    probability: dict[str, float]
+    heldout: dict[str, float]
+    occam: dict[str, float]
+
+
+def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, inflation: float,
+                folds: int = 2, blocks: int = 10) -> Evidence:  # fmt: skip
+    """Probability of each type.
+
+    The frames are cut into blocks; each fold is fitted without every other block, and the left-out frames are then
+    explained with the joint and the points fixed and only their states and depth errors free. A difference of these
+    held-out likelihoods (over the inflation by correlated errors) is a data term that no type gets for free by its extra
+    parameters; what it does not see, how improbable a priori it is that a hinge comes out as a slide, is the ratio of
+    prior to posterior width (Savage-Dickey).
+    """
+    heldout = dict.fromkeys(states, 0.0)
+    T = obs.seen.shape[1]
+    block = (np.arange(T) * blocks // T) % folds
+    for fold in range(folds):
+        out = block == fold
+        for kind, st in states.items():
+            heldout[kind] += _heldout(st, obs, noise, out) / 2 / inflation
+    occam = {kind: _occam(st, obs, noise, inflation) for kind, st in states.items()}
+    score = {kind: np.log(PRIOR[kind]) - heldout[kind] - occam[kind] for kind in states}
+    top = max(score.values())
+    total = sum(np.exp(v - top) for v in score.values())
+    return Evidence({kind: float(np.exp(score[kind] - top) / total) for kind in KINDS if kind in score}, heldout, occam)
+
+
+def _heldout(st: State, obs: Observations, noise: Noise, out: np.ndarray) -> float:
+    """Squared residuals of the frames `out` under a joint and points fitted to the others."""
+    keep = ~out
+    keep[st.anchor] = True
+    train = Observations(obs.uv, obs.log_depth, obs.seen & keep, obs.ranged & keep, obs.K, obs.T_camera_world, obs.link,
+                         obs.basis)  # fmt: skip
+    fitted, _ = refine(st, train, noise, None, iterations=3)
+    # Points that the other frames hardly see would carry their own error into the left-out ones.
+    held = (train.seen.sum(1) >= 4)[:, None] & obs.seen & ~keep
+    test = Observations(obs.uv, obs.log_depth, held, obs.ranged & held, obs.K, obs.T_camera_world, obs.link, obs.basis)
+    d = fitted.twist.basis().shape[1]
+    rows = d + OWN * np.arange(len(fitted.s))
+    for _ in range(3):
+        r, X, cam = residuals(fitted, test, noise)
+        w, _ = weigh(r, test, None)
+        n = normal_equations(fitted, test, noise, r, X, cam, w, 0.0)
+        s, field = fitted.s.copy(), fitted.field.copy()
+        for t in np.flatnonzero(~keep):
+            cols = rows[t] + np.arange(OWN)
+            step = -np.linalg.solve(n.H[np.ix_(cols, cols)] + 1e-9 * np.eye(OWN), n.g[cols])
+            s[t] += step[0]
+            field[t] += step[1:]
+        fitted = State(fitted.twist, s, fitted.points, field, fitted.anchor)
+    r, _, _ = residuals(fitted, test, noise)
+    return weigh(r, test, None)[1]
+
+
+def _occam(st: State, obs: Observations, noise: Noise, inflation: float) -> float:
+    """Logarithm of prior over posterior width of the parameters that a slide does not have."""
+    if st.twist.kind == "prismatic":
+        return 0.0
+    r, X, cam = residuals(st, obs, noise)
+    w, _ = weigh(r, obs, None)
+    cov = joint_covariance(normal_equations(st, obs, noise, r, X, cam, w, 1e-6), st) * inflation
+    stroke = float(np.ptp(st.s))
+    B = st.twist.basis()
+    v = st.twist.v / max(np.linalg.norm(st.twist.v), 1e-12)
+    across = np.linalg.svd(v[None])[2][1:]  # two directions across the origin's motion
+    turn = stroke * across @ B[:3] @ cov @ B[:3].T @ across.T
+    sign, logdet = np.linalg.slogdet(turn + 1e-18 * np.eye(2))
+    width = np.log(TURN_PRIOR**2) - 0.5 * logdet
+    if st.twist.kind == "screw":
+        w_hat = st.twist.w / max(np.linalg.norm(st.twist.w), 1e-12)
+        grad = w_hat @ B[3:] + (st.twist.v / max(np.linalg.norm(st.twist.w), 1e-6)) @ B[:3]
+        spread = stroke * np.sqrt(max(float(grad @ cov @ grad), 1e-18))
+        width += np.log(PITCH_PRIOR * st.twist.size) - np.log(spread)
+    return max(float(width), 0.0)
+
+
+def joint_covariance(n: Normal, st: State) -> np.ndarray:
+    """(d, d) covariance of the twist's step, everything else marginalised."""
+    d = st.twist.basis().shape[1]
+    return covariance(n, st)[:d, :d]
+
+
+def covariance(n: Normal, st: State) -> np.ndarray:
+    """(P, P) covariance of joint and frames, points marginalised, the anchor's state held."""
+    S, _, _ = reduced(n)
+    d = st.twist.basis().shape[1]
+    free = np.ones(len(S), bool)
+    free[d + OWN * st.anchor] = False
+    scale = 1 / np.sqrt(np.maximum(np.diag(S)[free], 1e-30))
+    A = S[np.ix_(free, free)] * scale[:, None] * scale
+    out = np.zeros_like(S)
+    out[np.ix_(free, free)] = np.linalg.inv(A + 1e-11 * np.eye(len(A))) * scale[:, None] * scale
+    return out
