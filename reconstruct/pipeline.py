@@ -294,6 +294,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     from reconstruct.depth import depth_scale
     from reconstruct.hand.scale import hand_scale
     from reconstruct.joint.fit import fit_joint
+    from reconstruct.joint.rigid.cues import fit_from_cues
     from reconstruct.others import second_part
 
     notes: list[str] = []
@@ -302,15 +303,31 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     if focal is None:
         focal = video.focal_px
 
-    def find() -> JointFit:
-        return fit_joint(video, tracks, focal, seed, stages.progress.update)
+    tracks_cue = folder.read("tracks", "uv", "visible") if folder is not None and "tracks" in given else {}
+    ranged = camera is not None and folder is not None and ("depth" in given or "xyz_world" in tracks_cue)
 
-    fit: JointFit = stages.run("joint", find, ("joint",), options={"focal": focal})
+    def find() -> JointFit:
+        if not ranged:
+            return fit_joint(video, tracks, focal, seed, stages.progress.update)
+        depth, metric = None, bool(camera.get("metric", np.array(True)))
+        if "xyz_world" not in tracks_cue:
+            cue = folder.read("depth", "depth")
+            depth = cues_io.expect_shape(np.asarray(cue["depth"]), (len(video), None, None), "depth of cues/depth.npz")
+            metric = bool(cue.get("metric", np.array(True)))
+        moving = folder.read("masks", "moving")["moving"] if folder.users("masks") else None
+        return fit_from_cues(tracks, camera, depth, tracks_cue.get("xyz_world"), moving, video.size, metric, seed)
+
+    with_depth = {key: given.get(key) for key in ("depth", "camera", "masks")} if ranged else None
+    fit: JointFit = stages.run("joint", find, ("joint",), options={"focal": focal, "with_depth": with_depth})
+    if ranged and fit.verdict == "refused":
+        notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")
+        ranged = False
+        fit = stages.run("joint", find, ("joint",), options={"focal": focal, "with_depth": None})
     if fit.verdict == "refused":
         return fit, notes
 
     def scaled() -> JointFit:
-        if folder is not None and "depth" in given:
+        if folder is not None and "depth" in given and not ranged:
             depth = cues_io.metric_depth_from_cue(folder.read("depth", "depth"), len(video))
             if depth is not None:
                 return depth_scale(fit, tracks, depth, video.size)
@@ -318,9 +335,9 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
 
     fit = stages.run("scale", lambda: hand_scale(scaled(), hands, video.time), ("hand", "depth.py"),
                      options={"depth": given.get("depth")})  # fmt: skip
-    if "depth" in given and fit.scale_source != "depth":
+    if "depth" in given and fit.scale_source != "depth" and not ranged:
         notes.append("cues/depth.npz gives no scale: it is not metric or hardly meets the part's points")
-    if camera is not None and "T_world_camera" in camera:
+    if camera is not None and "T_world_camera" in camera and not ranged:
         fit = cues_io.in_world_of(fit, camera)
     if words := second_part(video, tracks, fit):
         notes.append(words)

@@ -24,7 +24,7 @@ class Bound:
     Attributes:
         axis: (3, 3), rad^2, of the unit axis.
         point: (3, 3), m^2, of the axis line at the foot of `about`; None of a slide.
-        q: (T,) standard deviation, rad or m, relative to the first frame.
+        q: (T,) standard deviation, rad or m, relative to the first frame; inf where it is more than the whole range.
         scale_weight: (N,) how much each point counts when the world's scale is set by the points (row 3), sum 1.
     """
 
@@ -121,14 +121,16 @@ def bound(given: Given, focal_known: bool = True) -> Bound:
     cov = np.zeros((size, size))
     part = H[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.maximum(np.diag(part), 1e-300))
-    cov[np.ix_(free, free)] = scale[:, None] * scale * np.linalg.pinv(part * scale[:, None] * scale, rcond=1e-12,
-                                                                     hermitian=True)  # fmt: skip
+    # What nothing holds (the states of frames that share no point with the others) has a huge variance, not none.
+    values, vectors = np.linalg.eigh(part * scale[:, None] * scale)
+    inverted = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+    cov[np.ix_(free, free)] = scale[:, None] * scale * inverted
     weight, by_depth = _scale_weight(inverse, X0, on, shot)
     if gauge is not None:
         cov = _scale_from_points(cov, gauge, left, inverse, weight, by_depth)
     E = tangent(axis)
     std_q = np.sqrt(np.maximum(np.diag(cov)[G + per * np.arange(T)], 0))
-    std_q[~seen[good][on].any(0)] = np.inf  # a frame in which nothing is seen has no bound
+    std_q[~seen[good][on].any(0) | (std_q > np.ptp(shot.q))] = np.inf
     scale_weight = np.zeros(len(scene.points))
     scale_weight[np.flatnonzero(keep)[good]] = weight
     point = E.T @ cov[2:4, 2:4] @ E if kind == "revolute" else None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruct.joint.rigid.observe import FLOOR, Noise, Observations
+from reconstruct.joint.rigid.observe import FLOOR, MOST, Noise, Observations, robust_mean
 from reconstruct.joint.rigid.twist import Twist, skew
 
 OWN = 4
@@ -49,10 +49,10 @@ class Normal:
 
 
 def residuals(st: State, obs: Observations, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, T, 3) residuals over their noise (u, v, log depth; 0 where there is none), world points, camera points."""
+    """(N, T, 3) residuals over their noise (u, v, log depth; 0 where there is none), world and camera points."""
     poses = st.twist.poses(st.s)
-    X = np.where(obs.link[:, None, None],
-                 np.einsum("tij,nj->nti", poses[:, :3, :3], st.points) + poses[:, :3, 3], st.points[:, None])  # fmt: skip
+    moved = np.einsum("tij,nj->nti", poses[:, :3, :3], st.points) + poses[:, :3, 3]
+    X = np.where(obs.link[:, None, None], moved, st.points[:, None])
     cam = np.einsum("tij,ntj->nti", obs.T_camera_world[:, :3, :3], X) + obs.T_camera_world[:, :3, 3]
     z = np.maximum(cam[..., 2], 1e-6)
     r = np.zeros(X.shape)
@@ -65,8 +65,10 @@ def residuals(st: State, obs: Observations, noise: Noise) -> tuple[np.ndarray, n
 
 
 def weigh(r: np.ndarray, obs: Observations, scale: float | None) -> tuple[np.ndarray, float]:
-    """(N, T) weights and the robust cost: Geman-McClure of that scale, or (None) one within CUT and zero beyond."""
+    """(N, T) weights and the cost: Geman-McClure of that scale, (None) one within CUT and zero beyond, or (inf) one."""
     r2 = np.sum(r**2, axis=-1)
+    if scale == np.inf:
+        return obs.seen.astype(float), float(np.sum(r2 * obs.seen))
     if scale is None:
         inside = obs.seen & (r2 < CUT)
         return inside.astype(float), float(np.sum(np.where(obs.seen, np.minimum(r2, CUT), 0.0)))
@@ -74,8 +76,24 @@ def weigh(r: np.ndarray, obs: Observations, scale: float | None) -> tuple[np.nda
     return obs.seen * g**2, float(np.sum(obs.seen * scale**2 * (1 - g)))
 
 
+def bending(s: np.ndarray) -> float:
+    """Information on a second difference of the states, from how they bend: 1 / (1.5 x the 90 % quantile)^2.
+
+    Hands move things smoothly, so that states that few tracks hold, or that none ties to the others, follow their
+    neighbours. Straight motion costs nothing, so the end points are kept.
+    """
+    if len(s) < 5:
+        return 0.0
+    return float(1 / max(1.5 * np.quantile(np.abs(np.diff(s, 2)), 0.9), 1e-5 * np.ptp(s), 1e-12) ** 2)
+
+
+def loose(s: np.ndarray) -> float:
+    """A prior on second differences that only fills gaps: ten times the whole range."""
+    return float(1e-2 / max(np.ptp(s), 1e-9) ** 2)
+
+
 def normal_equations(st: State, obs: Observations, noise: Noise, r, X, cam, w, stiff: float) -> Normal:
-    """Analytic Jacobians, all frames at once; `stiff` holds states that nothing sees between their neighbours."""
+    """Analytic Jacobians, all frames at once; `stiff` is the information on second differences of the states."""
     N, T = obs.seen.shape
     z = np.maximum(cam[..., 2], 1e-6)
     fx, fy = obs.K[0, 0], obs.K[1, 1]
@@ -128,7 +146,7 @@ def normal_equations(st: State, obs: Observations, noise: Noise, r, X, cam, w, s
     gp = np.einsum("ntij,nti->nj", C, r, optimize=True)
     if T > 2 and stiff > 0:
         D2 = np.diff(np.eye(T), 2, axis=0)
-        bend = stiff * max(float(np.median(own[:, 0, 0])), 1e-12) * (D2.T @ D2)
+        bend = stiff * (D2.T @ D2)
         H[np.ix_(rows, rows)] += bend
         g[rows] += bend @ st.s
     return Normal(H, g, Hpp, gp, L)
@@ -157,13 +175,14 @@ def solve(S: np.ndarray, g: np.ndarray, fixed: int) -> np.ndarray:
 
 
 def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iterations: int = 10,
-           stiff: float = 1e-6, tolerance: float = 1e-5) -> tuple[State, float]:  # fmt: skip
-    """Levenberg-Marquardt with one robust kernel; returns the state and its cost."""
+           stiff: float | None = None, tolerance: float = 1e-5) -> tuple[State, float]:  # fmt: skip
+    """Levenberg-Marquardt with one robust kernel; returns the state and its cost (without the states' prior)."""
+    stiff = loose(st.s) if stiff is None else stiff
     d = st.twist.basis().shape[1]
     rows = d + OWN * np.arange(len(st.s))
     r, X, cam = residuals(st, obs, noise)
     w, cost = weigh(r, obs, scale)
-    cost += prior(st, noise)
+    cost += prior(st, noise, stiff)
     damping = 1e-4
     for _ in range(iterations):
         n = normal_equations(st, obs, noise, r, X, cam, w, stiff)
@@ -178,7 +197,7 @@ def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iter
             trial = State(twist, s, st.points + dp, field, st.anchor)
             rt, Xt, camt = residuals(trial, obs, noise)
             wt, ct = weigh(rt, obs, scale)
-            ct += prior(trial, noise)
+            ct += prior(trial, noise, stiff)
             if ct <= cost:
                 better = ct < cost * (1 - tolerance)
                 st, r, X, cam, w, cost = trial, rt, Xt, camt, wt, ct
@@ -187,25 +206,24 @@ def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iter
             damping *= 20
         if not better:
             break
-    return st, cost
+    return st, cost - prior(st, noise, stiff) + prior(st, noise, 0.0)
 
 
-def prior(st: State, noise: Noise) -> float:
-    return float(np.sum((st.field / noise.field) ** 2))
+def prior(st: State, noise: Noise, stiff: float) -> float:
+    """What the depth errors and the bending of the states cost."""
+    return float(np.sum((st.field / noise.field) ** 2) + stiff * np.sum(np.diff(st.s, 2) ** 2))
 
 
-def fields_and_points(st: State, obs: Observations, noise: Noise) -> State:
+def points_of(st: State, obs: Observations) -> State:
     """The state with its points where its own motion carries them all to (robust means of lifted points)."""
-    from reconstruct.joint.rigid.observe import robust_mean
-
     world = obs.lift(st.field)
     poses = st.twist.poses(st.s)
     back = np.einsum("tji,ntj->nti", poses[:, :3, :3], world - poses[:, :3, 3])
     return replace(st, points=robust_mean(np.where(obs.link[:, None, None], back, world)))
 
 
-def estimate_noise(r: np.ndarray, st: State, obs: Observations, noise: Noise, most: Noise) -> Noise:
-    """Noise from the residuals of what agrees (median absolute deviations), never more than `most`."""
+def estimate_noise(r: np.ndarray, st: State, obs: Observations, noise: Noise) -> Noise:
+    """Noise from the residuals of what agrees (median absolute deviations), never more than MOST."""
     r2 = np.sum(r**2, axis=-1)
     good = obs.seen & (r2 < 4 * CUT)
     if good.sum() < 50:
@@ -214,10 +232,10 @@ def estimate_noise(r: np.ndarray, st: State, obs: Observations, noise: Noise, mo
     seen = good.sum(1)
     give = np.sqrt(seen.sum() * 3 / max((seen * 3 - 3).clip(0).sum() - OWN * obs.seen.shape[1], 1.0))
     mad = lambda x: 1.4826 * float(np.median(np.abs(x)))  # noqa: E731
-    px = min(give * noise.px * mad(r[..., :2][good]), most.px)
+    px = min(give * noise.px * mad(r[..., :2][good]), MOST.px)
     depth, field = noise.depth, noise.field
     with_depth = good & obs.ranged
     if with_depth.sum() > 50:
-        depth = min(noise.depth * mad(r[..., 2][with_depth]), most.depth)
-        field = min(float(np.sqrt(np.mean(st.field**2))) * 1.1, most.field)
+        depth = min(noise.depth * mad(r[..., 2][with_depth]), MOST.depth)
+        field = min(float(np.sqrt(np.mean(st.field**2))) * 1.1, MOST.field)
     return Noise(max(px, FLOOR.px), max(depth, FLOOR.depth), max(field, FLOOR.field))

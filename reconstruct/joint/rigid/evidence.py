@@ -6,11 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruct.joint.rigid.bundle import OWN, Normal, State, normal_equations, reduced, refine, residuals, weigh
+from reconstruct.joint.rigid.bundle import (
+    OWN,
+    Normal,
+    State,
+    loose,
+    normal_equations,
+    reduced,
+    refine,
+    residuals,
+    weigh,
+)
 from reconstruct.joint.rigid.observe import Noise, Observations
 from reconstruct.joint.rigid.twist import KINDS
 
-PRIOR = {"prismatic": 0.45, "revolute": 0.45, "screw": 0.10}
+PRIOR = {"prismatic": 0.48, "revolute": 0.48, "screw": 0.04}
 TURN_PRIOR = 1.0
 """Total rotation of a hinge, rad: standard deviation of the prior in each of the two directions across the motion."""
 PITCH_PRIOR = 0.3
@@ -34,13 +44,13 @@ class Evidence:
 
 def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, inflation: float,
                 folds: int = 2, blocks: int = 10) -> Evidence:  # fmt: skip
-    """Probability of each type.
+    """Probability of each type; `obs` holds only what agrees with the best one, so that nothing flips in or out.
 
     The frames are cut into blocks; each fold is fitted without every other block, and the left-out frames are then
     explained with the joint and the points fixed and only their states and depth errors free. A difference of these
-    held-out likelihoods (over the inflation by correlated errors) is a data term that no type gets for free by its extra
-    parameters; what it does not see, how improbable a priori it is that a hinge comes out as a slide, is the ratio of
-    prior to posterior width (Savage-Dickey).
+    held-out likelihoods (over the inflation by correlated errors) is a data term that no type gets for free by its
+    extra parameters; what it does not see, how improbable a priori it is that a hinge comes out as a slide, is the
+    ratio of prior to posterior width (Savage-Dickey).
     """
     heldout = dict.fromkeys(states, 0.0)
     T = obs.seen.shape[1]
@@ -53,7 +63,8 @@ def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, infla
     score = {kind: np.log(PRIOR[kind]) - heldout[kind] - occam[kind] for kind in states}
     top = max(score.values())
     total = sum(np.exp(v - top) for v in score.values())
-    return Evidence({kind: float(np.exp(score[kind] - top) / total) for kind in KINDS if kind in score}, heldout, occam)
+    probability = {kind: float(np.exp(score[kind] - top) / total) for kind in KINDS if kind in score}
+    return Evidence(probability, heldout, occam)
 
 
 def _heldout(st: State, obs: Observations, noise: Noise, out: np.ndarray) -> float:
@@ -62,7 +73,7 @@ def _heldout(st: State, obs: Observations, noise: Noise, out: np.ndarray) -> flo
     keep[st.anchor] = True
     train = Observations(obs.uv, obs.log_depth, obs.seen & keep, obs.ranged & keep, obs.K, obs.T_camera_world, obs.link,
                          obs.basis)  # fmt: skip
-    fitted, _ = refine(st, train, noise, None, iterations=3)
+    fitted, _ = refine(st, train, noise, np.inf, iterations=4)
     # Points that the other frames hardly see would carry their own error into the left-out ones.
     held = (train.seen.sum(1) >= 4)[:, None] & obs.seen & ~keep
     test = Observations(obs.uv, obs.log_depth, held, obs.ranged & held, obs.K, obs.T_camera_world, obs.link, obs.basis)
@@ -70,7 +81,7 @@ def _heldout(st: State, obs: Observations, noise: Noise, out: np.ndarray) -> flo
     rows = d + OWN * np.arange(len(fitted.s))
     for _ in range(3):
         r, X, cam = residuals(fitted, test, noise)
-        w, _ = weigh(r, test, None)
+        w, _ = weigh(r, test, np.inf)
         n = normal_equations(fitted, test, noise, r, X, cam, w, 0.0)
         s, field = fitted.s.copy(), fitted.field.copy()
         for t in np.flatnonzero(~keep):
@@ -80,7 +91,7 @@ def _heldout(st: State, obs: Observations, noise: Noise, out: np.ndarray) -> flo
             field[t] += step[1:]
         fitted = State(fitted.twist, s, fitted.points, field, fitted.anchor)
     r, _, _ = residuals(fitted, test, noise)
-    return weigh(r, test, None)[1]
+    return weigh(r, test, np.inf)[1]
 
 
 def _occam(st: State, obs: Observations, noise: Noise, inflation: float) -> float:
@@ -89,7 +100,7 @@ def _occam(st: State, obs: Observations, noise: Noise, inflation: float) -> floa
         return 0.0
     r, X, cam = residuals(st, obs, noise)
     w, _ = weigh(r, obs, None)
-    cov = joint_covariance(normal_equations(st, obs, noise, r, X, cam, w, 1e-6), st) * inflation
+    cov = joint_covariance(normal_equations(st, obs, noise, r, X, cam, w, loose(st.s)), st) * inflation
     stroke = float(np.ptp(st.s))
     B = st.twist.basis()
     v = st.twist.v / max(np.linalg.norm(st.twist.v), 1e-12)

@@ -11,9 +11,10 @@ from reconstruct.joint.rigid.bundle import (
     CUT,
     OWN,
     State,
+    bending,
     estimate_noise,
-    fields_and_points,
     normal_equations,
+    points_of,
     refine,
     residuals,
     weigh,
@@ -27,7 +28,7 @@ MIN_TRACKS = 8
 KEYS, SAMPLE = 24, 150
 """Frames and tracks of the search; the last refinements take all."""
 DECIDE_FRAMES, DECIDE_TRACKS = 32, 160
-CERTAIN = 0.995
+CERTAIN = 0.9
 AGREE = 0.35
 """Share of the link's observations that has to agree with the joint."""
 SURE = 0.9
@@ -50,7 +51,6 @@ def fit_rigid(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndar
     rng = np.random.default_rng(seed)
     depth = np.asarray(depth, float)
     N, T = visible.shape
-    noise = Noise()
     if link is None:
         link = moving_tracks(observe(uv, visible, depth, K, T_world_camera, np.zeros(N, bool)))
     obs = observe(uv, visible, depth, K, T_world_camera, np.asarray(link, bool))
@@ -58,7 +58,7 @@ def fit_rigid(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndar
     if (usable & obs.link).sum() < MIN_TRACKS:
         return _refused(f"only {int((usable & obs.link).sum())} tracks lie on something that moves; "
                         "film more of the moving part", N)  # fmt: skip
-    field = static_field(obs, noise)
+    field, noise = static_field(obs)
     world = obs.lift(field)
     world[~obs.link] = np.nan
     keys = key_frames(world)
@@ -76,16 +76,17 @@ def fit_rigid(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndar
     every = np.arange(T)
     # The type is decided on a part of frames and tracks, and on everything only where that part does not tell.
     probability: dict[str, float] = {}
-    for frames, tracks in ((_thin(every, DECIDE_FRAMES, keys), _sample(obs, DECIDE_TRACKS, rng)), (every, np.arange(N))):
+    parts = ((_thin(every, DECIDE_FRAMES, keys), _sample(obs, DECIDE_TRACKS, rng)), (every, np.arange(N)))
+    for frames, tracks in parts:
         some = obs.of(tracks, frames)
-        over = {k: _spread(st, keys, frames, some, field, noise) for k, st in states.items()}
+        over = {k: _spread(st, keys, frames, some, field) for k, st in states.items()}
         best, probability, told = _decide(over, some, noise)
         if max(probability.values()) > CERTAIN or len(frames) == T:
             break
-    whole = _spread(best, frames, every, obs, field, told)
+    whole = _spread(best, frames, every, obs, field)
     whole, _ = refine(whole, obs, told, 3.0, iterations=3, tolerance=1e-3)
     best, kept, noise = _polish(whole, obs, told)
-    best, _ = refine(best, kept, noise, None, iterations=4, tolerance=1e-7)
+    best, _ = refine(best, kept, noise, None, iterations=5, stiff=bending(best.s), tolerance=1e-7)
     reason = _why_not(best, obs, noise, poses, world, keys, part)
     if reason:
         return replace(_refused(reason, N), type_probability=probability)
@@ -107,7 +108,7 @@ def _sample(obs: Observations, count: int, rng: np.random.Generator) -> np.ndarr
 
 
 def moving_tracks(obs: Observations) -> np.ndarray:
-    """(N,) bool: tracks that no place at rest in the world explains (median miss above 2 px and 1 % of the depth)."""
+    """(N,) bool: tracks that no place at rest explains, by how far their pixels are from its picture."""
     X = robust_mean(obs.lift())
     cam = np.einsum("tij,nj->nti", obs.T_camera_world[:, :3, :3], X) + obs.T_camera_world[:, :3, 3]
     uv = cam[..., :2] / np.maximum(cam[..., 2:], 1e-6) * obs.K[[0, 1], [0, 1]] + obs.K[:2, 2]
@@ -121,7 +122,9 @@ def key_frames(world: np.ndarray) -> np.ndarray:
     """Frames spread evenly over time, those that see a fair number of the link's points."""
     count = np.isfinite(world[..., 0]).sum(0)
     good = np.flatnonzero(count >= max(6, 0.15 * count.max()))
-    return good[np.unique(np.linspace(0, len(good) - 1, min(KEYS, len(good))).round().astype(int))] if len(good) else good
+    if len(good) == 0:
+        return good
+    return good[np.unique(np.linspace(0, len(good) - 1, min(KEYS, len(good))).round().astype(int))]
 
 
 def _search(found: list, poses: Poses, obs: Observations, field: np.ndarray, keys: np.ndarray, part: np.ndarray,
@@ -137,7 +140,7 @@ def _search(found: list, poses: Poses, obs: Observations, field: np.ndarray, key
         tried[twist.kind].append(twist)
         full = np.interp(np.arange(len(keys)), poses.frames, s)
         full -= full[poses.anchor]
-        st = fields_and_points(State(twist, full, np.zeros((len(some.link), 3)), field[keys], poses.anchor), some, noise)
+        st = points_of(State(twist, full, np.zeros((len(some.link), 3)), field[keys], poses.anchor), some)
         st, cost = refine(st, some, noise, 6.0, iterations=4, tolerance=1e-3)
         if twist.kind not in out or cost < out[twist.kind][0]:
             out[twist.kind] = (cost, st)
@@ -148,12 +151,11 @@ def _search(found: list, poses: Poses, obs: Observations, field: np.ndarray, key
         states[kind] = (cost, st)
     kind = min(states, key=lambda k: states[k][0])
     r, _, _ = residuals(states[kind][1], some, noise)
-    noise = estimate_noise(r, states[kind][1], some, noise, noise)
+    noise = estimate_noise(r, states[kind][1], some, noise)
     return {kind: st for kind, (_, st) in states.items()}, keys, noise
 
 
-def _spread(st: State, keys: np.ndarray, frames: np.ndarray, obs: Observations, field: np.ndarray,
-            noise: Noise) -> State:  # fmt: skip
+def _spread(st: State, keys: np.ndarray, frames: np.ndarray, obs: Observations, field: np.ndarray) -> State:
     """The same joint over other frames and tracks: states in between, points from all that is seen of them.
 
     Args:
@@ -165,7 +167,7 @@ def _spread(st: State, keys: np.ndarray, frames: np.ndarray, obs: Observations, 
     both = np.isin(frames, keys)
     f[both] = st.field[np.searchsorted(keys, frames[both])]
     anchor = int(np.searchsorted(frames, keys[st.anchor]))
-    return fields_and_points(State(st.twist, s, np.zeros((len(obs.link), 3)), f, anchor), obs, noise)
+    return points_of(State(st.twist, s, np.zeros((len(obs.link), 3)), f, anchor), obs)
 
 
 def _alike(a, b) -> bool:
@@ -187,7 +189,8 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
             starts = [_as_kind(st, kind), *([first[kind][0]] if kind in first else [])]
             options = [refine(o, obs, noise, 3.0, iterations=4, tolerance=1e-3) for o in starts]
             last[kind] = refine(min(options, key=lambda o: o[1])[0], obs, noise, None, iterations=4)[0]
-    probability = weigh_types(last, obs, noise, inflation).probability
+    agreed = replace(obs, seen=good > 0, ranged=obs.ranged & (good > 0))
+    probability = weigh_types(last, agreed, noise, inflation).probability
     return last[max(probability, key=probability.get)], probability, noise
 
 
@@ -195,7 +198,7 @@ def _polish(st: State, obs: Observations, noise: Noise) -> tuple[State, Observat
     """From a robust kernel to least squares over what agrees: noise, tracks that can be trusted, refinement."""
     for _ in range(2):
         r, _, _ = residuals(st, obs, noise)
-        noise = estimate_noise(r, st, obs, noise, Noise())
+        noise = estimate_noise(r, st, obs, noise)
         obs = replace(obs, seen=obs.seen & trusted(r, obs)[:, None])
         obs = replace(obs, ranged=obs.ranged & obs.seen)
         st, _ = refine(st, obs, noise, None, iterations=4)
@@ -248,7 +251,8 @@ def _why_not(st: State, obs: Observations, noise: Noise, poses: Poses, world, ke
     stroke = float(np.median(np.linalg.norm(moved, axis=-1).max(1)))
     z = float(np.median(np.exp(obs.log_depth[obs.ranged])))
     if stroke * obs.K[0, 0] / z < 3 * noise.px and stroke < 3 * noise.depth * z:
-        return f"nothing moves: the part's points shift by {stroke * 1e3:.1f} mm, less than their noise; film a larger motion"
+        return (f"nothing moves: the part's points shift by {stroke * 1e3:.1f} mm, less than their noise; "
+                "film a larger motion")  # fmt: skip
     # The same points as a free rigid body.
     tolerance = 3 * (np.median(poses.residual) + z * (noise.px / obs.K[0, 0] + 1e-4))
     local = world[np.ix_(part, keys)][:, poses.frames]
@@ -261,8 +265,8 @@ def _why_not(st: State, obs: Observations, noise: Noise, poses: Poses, world, ke
     free_share = np.mean(free_miss[known] < tolerance)
     lost = np.mean((free_miss[known] < tolerance) & (joint_miss[known] > 2 * tolerance)) / max(free_share, 1e-9)
     if lost > 1 / 3:
-        return (f"the part moves as a free body, not about one joint: {lost:.0%} of what follows a rigid motion does not "
-                f"follow the best joint ({st.twist.kind}); film one part on one joint")  # fmt: skip
+        return (f"the part moves as a free body, not about one joint: {lost:.0%} of what follows a rigid motion does "
+                f"not follow the best joint ({st.twist.kind}); film one part on one joint")  # fmt: skip
     if agree < AGREE:
         return (f"no joint: only {agree:.0%} of the moving tracks' observations agree with the best one "
                 f"({st.twist.kind}); the part bends, or several parts move; film one rigid part")  # fmt: skip
@@ -274,7 +278,7 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
     T = len(st.s)
     r, X, cam = residuals(st, obs, noise)
     w, _ = weigh(r, obs, None)
-    n = normal_equations(st, obs, noise, r, X, cam, w, 1e-6)
+    n = normal_equations(st, obs, noise, r, X, cam, w, bending(st.s))
     cov = covariance(n, st) * correlation(r, w > 0)
     d = st.twist.basis().shape[1]
     link = obs.link & (w.sum(1) >= 2)
@@ -304,8 +308,7 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
         reason = (f"{names[0]} and {names[1]} explain the motion almost equally well (p = {p:.2f}); "
                   "a larger motion would tell")  # fmt: skip
     std = {"axis_deg": float(np.degrees(np.sqrt(np.trace(axis_cov)))),
-           "point_m": 0.0 if point_cov is None else float(np.sqrt(np.trace(point_cov))), "q": q_std,
-           "axis_cov": axis_cov, "point_cov": point_cov}  # fmt: skip
+           "point_m": 0.0 if point_cov is None else float(np.sqrt(np.trace(point_cov))), "q": q_std}  # fmt: skip
     px = np.linalg.norm(r[..., :2], axis=-1)[w > 0] * noise.px
     T_camera_world = obs.T_camera_world[0]
     fit = JointFit(verdict, reason, kind, probability, axis, point, pitch, q, np.arange(T), obs.K, T_camera_world,
@@ -317,7 +320,7 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
 
 
 def _derivatives(st: State, centre: np.ndarray):
-    """Axis, its point nearest to `centre`, pitch, dq/ds, and their derivatives by the twist's step (central differences)."""
+    """Axis, its point nearest to `centre`, pitch, dq/ds; derivatives by the twist's step (central differences)."""
 
     def of(step):
         twist, length = st.twist.moved(step)

@@ -115,9 +115,9 @@ def register(world: np.ndarray, rounds: int = 2) -> Poses | None:
 def hypotheses(poses: Poses, rng: np.random.Generator, count: int = 60) -> list[tuple[Twist, np.ndarray]]:
     """First joints with their states in the poses' frames, best first: slides, hinges and screws.
 
-    A slide's direction is the dominant displacement of the centroid; a hinge's axis the dominant relative rotation vector,
-    its pivot solves (I - R_t) c = d_t on the plane through the centroid; a screw keeps the shift along the axis. Each is
-    drawn from random pairs and triples of frames as well as from all, and judged by the poses' robust distance.
+    A slide's direction is the dominant displacement of the centroid; a hinge's axis the dominant relative rotation
+    vector, its pivot solves (I - R_t) c = d_t on the plane through the centroid; a screw keeps the shift along the
+    axis. Each is drawn from random triples of frames as well as from all, and judged by the poses' robust distance.
     """
     centre = np.nanmedian(poses.points, axis=0)
     off = poses.points - centre

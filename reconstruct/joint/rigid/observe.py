@@ -21,7 +21,7 @@ class Noise:
     field: float = 0.02
 
 
-FLOOR = Noise(0.02, 1e-4, 1e-4)
+FLOOR, MOST = Noise(0.02, 1e-4, 1e-4), Noise(3.0, 0.1, 0.1)
 
 
 @dataclass(frozen=True)
@@ -73,18 +73,18 @@ def observe(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndarra
     return Observations(uv, logz, seen, ranged, np.asarray(K, float), np.linalg.inv(T_world_camera), link, basis)
 
 
-def static_field(obs: Observations, noise: Noise, rounds: int = 4) -> np.ndarray:
-    """(T, 3) the depths' smooth error in every frame as the resting points see it.
+def static_field(obs: Observations, rounds: int = 4) -> tuple[np.ndarray, Noise]:
+    """(T, 3) the depths' smooth error in every frame as the resting points see it, and how large such errors are.
 
-    Each resting point has one place in the world; what its depths deviate from it in a frame, with a prior of the field's
-    size, is that frame's error. Alternates between places (robust means) and fields. Their common part cannot be seen by
-    a camera that rests and stays zero on average.
+    Each resting point has one place in the world; what its depths deviate from it in a frame, with a prior of the
+    field's size, is that frame's error. Alternates between places (robust means) and fields. Their common part cannot
+    be seen by a camera that rests and stays zero on average.
     """
     T = obs.seen.shape[1]
     rest = np.flatnonzero(~obs.link & (obs.ranged.sum(1) >= 2))
-    field = np.zeros((T, 3))
+    field, noise = np.zeros((T, 3)), Noise()
     if len(rest) < 4:
-        return field
+        return field, noise
     some = obs.of(rest, np.arange(T))
     R, t = some.T_camera_world[:, :3, :3], some.T_camera_world[:, :3, 3]
     for _ in range(rounds):
@@ -95,18 +95,18 @@ def static_field(obs: Observations, noise: Noise, rounds: int = 4) -> np.ndarray
         w = some.ranged / (1 + (e / (3 * noise.depth)) ** 2) ** 2 / noise.depth**2
         H = np.einsum("nt,ntk,ntl->tkl", w, some.basis, some.basis) + np.eye(3) / noise.field**2
         field = np.linalg.solve(H, np.einsum("nt,ntk,nt->tk", w, some.basis, r)[..., None])[..., 0]
-    return field
+        spread = 1.4826 * float(np.median(np.abs(e[some.ranged])))
+        noise = Noise(noise.px, float(np.clip(spread, noise.depth / 3, MOST.depth)),
+                      float(np.clip(1.5 * np.sqrt(np.mean(field**2)), noise.field / 3, MOST.field)))  # fmt: skip
+    return field, noise
 
 
 def robust_mean(points: np.ndarray, rounds: int = 3) -> np.ndarray:
     """(N, 3) means over frames of (N, T, 3) points (NaN where unknown) with far ones weighed down."""
     finite = np.isfinite(points[..., 0])
-    with np.errstate(all="ignore"):
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            mean = np.nan_to_num(np.nanmedian(points, axis=1))
+    mean = np.zeros((len(points), 3))
+    some = finite.any(1)
+    mean[some] = np.nanmedian(points[some], axis=1)
     values = np.where(finite[..., None], points, 0.0)
     for _ in range(rounds):
         d2 = np.sum((values - mean[:, None]) ** 2, axis=-1)

@@ -1,8 +1,8 @@
 """One family for slide, hinge and screw: motion along a constant twist.
 
-A twist (w, v) at an origin o moves a point x with velocity w x (x - o) + v; after "time" s the link has the pose exp(s (w, v)).
-A slide is w = 0, a hinge w . v = 0, a screw the rest: the slide is the limit of a hinge whose axis goes to infinity, and
-no parameter becomes singular on the way (with an axis and a pivot the pivot would run away).
+A twist (w, v) at an origin o moves a point x with velocity w x (x - o) + v; after "time" s the link has the pose
+exp(s (w, v)). A slide is w = 0, a hinge w . v = 0, a screw the rest: the slide is the limit of a hinge whose axis goes
+to infinity, and no parameter becomes singular on the way (with an axis and a pivot the pivot would run away).
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ class Twist:
 
     def moved(self, step: np.ndarray) -> tuple[Twist, float]:
         """The twist after a step in its basis, and the factor by which its states grow (the scaled length stays 1)."""
-        return make(self.kind, *np.split(self.xi + self.basis() @ step, 2), self.origin, self.size)
+        xi = self.xi + self.basis() @ step
+        return make(self.kind, xi[:3], xi[3:], self.origin, self.size)
 
     def poses(self, s: np.ndarray) -> np.ndarray:
         """(T, 4, 4) exp(s (w, v)) about the origin, in world coordinates."""
