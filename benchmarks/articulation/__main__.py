@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import sys
+import zlib
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -97,7 +98,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--extents", nargs="+", default=["full", "small"], choices=["full", "small"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--limit", type=int, help="at most so many cases, spread evenly over all that were asked for")
+    parser.add_argument("--limit", type=int, help="only so many cases, drawn from all that were asked for")
     parser.add_argument("--focal-unknown", action="store_true", help="row 3: do not give the focal length")
     parser.add_argument("--out", type=Path, help="JSON lines, one a case; appended to")
     parser.add_argument("--table", type=Path, help="print the table of such a file and stop")
@@ -110,8 +111,9 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     todo = list(cases(args))
     if args.limit and args.limit < len(todo):
-        step = len(todo) / args.limit
-        todo = [todo[int(k * step)] for k in range(args.limit)]
+        # The same order for every limit: a larger one goes on with the cases of a smaller one.
+        order = sorted(range(len(todo)), key=lambda k: zlib.crc32(f"{args.seed} {todo[k].key}".encode()))
+        todo = [todo[k] for k in order[: args.limit]]
     rows = []
     if args.out and args.out.is_file():
         rows = [json.loads(line) for line in args.out.read_text().splitlines()]
