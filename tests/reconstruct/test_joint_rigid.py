@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.models import joint_transform
-from reconstruct.joint.rigid import bundle, fit_rigid
+from reconstruct.joint.rigid import bundle, fit_rigid, normal
 from reconstruct.joint.rigid.cues import fit_from_cues, sample
 from reconstruct.joint.rigid.kabsch import kabsch
 from reconstruct.joint.rigid.observe import Noise, Observations
@@ -62,11 +62,11 @@ def test_normal_equations_are_the_derivatives(kind):
     s = np.append(0, rng.normal(size=T - 1))
     points = np.array([0, 0, 1.5]) + 0.2 * rng.normal(size=(N, 3))
     st, noise = bundle.State(twist, s, points, 0.02 * rng.normal(size=(T, 3)), 0), Noise()
-    P = d + bundle.OWN * T
+    P = d + normal.OWN * T
 
     def r(x):
         moved, factor = twist.moved(x[:d])
-        own = x[d:P].reshape(T, bundle.OWN)
+        own = x[d:P].reshape(T, normal.OWN)
         points_x = points + x[P:].reshape(N, 3)
         return bundle.residuals(bundle.State(moved, (s + own[:, 0]) * factor, points_x, st.field + own[:, 1:], 0),
                                 obs, noise)[0].ravel()  # fmt: skip
@@ -74,12 +74,26 @@ def test_normal_equations_are_the_derivatives(kind):
     h = 1e-6
     J = np.stack([(r(h * e) - r(-h * e)) / (2 * h) for e in np.eye(P + 3 * N)], axis=-1)
     full = J.T @ J
-    made = bundle.normal_equations(st, obs, noise, *bundle.residuals(st, obs, noise), np.ones((N, T)), 0.0)
+    made = normal.normal_equations(st, obs, noise, *bundle.residuals(st, obs, noise), np.ones((N, T)), 0.0)
     prior = np.diag(np.concatenate([np.zeros(d), np.tile(np.r_[0, np.full(3, noise.field**-2)], T)]))
     size = np.abs(full).max()
-    np.testing.assert_allclose(made.H, full[:P, :P] + prior, atol=1e-7 * size)
-    np.testing.assert_allclose(made.L.reshape(P, -1), full[:P, P:], atol=1e-7 * size)
+    np.testing.assert_allclose(made.dense(), full[:P, :P] + prior, atol=1e-7 * size)
+    np.testing.assert_allclose(made.coupling().reshape(P, -1), full[:P, P:], atol=1e-7 * size)
     np.testing.assert_allclose(made.gp.ravel(), (J.T @ r(np.zeros(P + 3 * N)))[P:], rtol=1e-5, atol=1e-3)
+
+
+def test_conjugate_gradients_solve_what_factorisation_solves(monkeypatch):
+    """Large problems never form the reduced system: the answer and its uncertainty are those of the small way."""
+    uv, visible, z, pose, link = tracks_of("revolute", STROKE, px=0.5, depth=0.01, field=0.02)
+    small = fit_rigid(uv, visible, z, K, pose, link)
+    monkeypatch.setattr(normal, "DENSE_FRAMES", 5)
+    large = fit_rigid(uv, visible, z, K, pose, link)
+    assert large.type == small.type
+    assert angle(large.axis, small.axis) < 0.05 * small.std["axis_deg"]
+    np.testing.assert_allclose(large.q, small.q, atol=1e-4)
+    assert large.std["axis_deg"] == pytest.approx(small.std["axis_deg"], rel=0.05)
+    assert large.std["point_m"] == pytest.approx(small.std["point_m"], rel=0.05)
+    assert 0.5 < np.median(large.std["q"][5:] / small.std["q"][5:]) < 1.2
 
 
 def test_slide_is_the_limit_of_a_far_hinge():

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reconstruct.joint.rigid.normal import OWN, normal_equations, reduced_step
 from reconstruct.joint.rigid.observe import FLOOR, MOST, Noise, Observations, robust_mean
-from reconstruct.joint.rigid.twist import Twist, skew
+from reconstruct.joint.rigid.twist import Twist
 
-OWN = 4
-"""Unknowns of each frame: the state and three coefficients of its depth error."""
 CUT = 16.3
 """Squared residual over its noise beyond which an observation is wrong (99.9 % of three unit normals)."""
 
@@ -30,22 +29,6 @@ class State:
     points: np.ndarray
     field: np.ndarray
     anchor: int
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations with the points still in them.
-
-    Attributes:
-        H: (P, P), g: (P,) of joint (d) and frames (4 each).  Hpp: (N, 3, 3), gp: (N, 3) of the points.
-        L: (P, N, 3) coupling.
-    """
-
-    H: np.ndarray
-    g: np.ndarray
-    Hpp: np.ndarray
-    gp: np.ndarray
-    L: np.ndarray
 
 
 def residuals(st: State, obs: Observations, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,88 +75,6 @@ def loose(s: np.ndarray) -> float:
     return float(1e-2 / max(np.ptp(s), 1e-9) ** 2)
 
 
-def normal_equations(st: State, obs: Observations, noise: Noise, r, X, cam, w, stiff: float) -> Normal:
-    """Analytic Jacobians, all frames at once; `stiff` is the information on second differences of the states."""
-    N, T = obs.seen.shape
-    z = np.maximum(cam[..., 2], 1e-6)
-    fx, fy = obs.K[0, 0], obs.K[1, 1]
-    P = np.zeros((N, T, 3, 3))
-    P[..., 0, 0], P[..., 1, 1] = fx / z / noise.px, fy / z / noise.px
-    P[..., 0, 2], P[..., 1, 2] = -fx * cam[..., 0] / z**2 / noise.px, -fy * cam[..., 1] / z**2 / noise.px
-    P[..., 2, 2] = obs.ranged / z / noise.depth
-    P *= np.sqrt(w)[..., None, None]
-    r = r * np.sqrt(w)[..., None]
-    W = np.einsum("ntij,tjk->ntik", P, obs.T_camera_world[:, :3, :3], optimize=True)
-    link = obs.link
-    C = np.array(W)
-    turn = st.twist.poses(st.s)[:, :3, :3]
-    C[link] = np.einsum("ntij,tjk->ntik", W[link], turn, optimize=True)
-    # A joint's step moves world points by a twist of each frame about the origin; so does the frame's own state.
-    to_frame = st.twist.spatial_jacobian(st.s) @ st.twist.basis()  # (T, 6, d)
-    d = to_frame.shape[-1]
-    six = np.concatenate([to_frame, np.broadcast_to(st.twist.xi[None, :, None], (T, 6, 1))], axis=-1)
-    Y = np.concatenate([-skew(X[link] - st.twist.origin), np.broadcast_to(np.eye(3), (*X[link].shape, 3))], axis=-1)
-    A = W[link] @ (Y @ six)  # (links, T, 3, d + 1)
-    size = d + OWN * T
-    H, g = np.zeros((size, size)), np.zeros(size)
-    F = obs.basis / noise.depth * (np.sqrt(w) * obs.ranged)[..., None]  # of the third residual only
-    L = np.zeros((size, N, 3))
-    rl = r[link]
-    H[:d, :d] = np.einsum("ntig,ntih->gh", A[..., :d], A[..., :d], optimize=True)
-    g[:d] = np.einsum("ntig,nti->g", A[..., :d], rl, optimize=True)
-    own = np.zeros((T, OWN, OWN))
-    own[:, 0, 0] = np.einsum("nti,nti->t", A[..., d], A[..., d])
-    own[:, 1:, 1:] = np.einsum("ntk,ntl->tkl", F, F, optimize=True) + np.eye(3) / noise.field**2
-    own[:, 0, 1:] = np.einsum("nt,ntk->tk", A[:, :, 2, d], F[link], optimize=True)
-    own[:, 1:, 0] = own[:, 0, 1:]
-    cross = np.zeros((T, d, OWN))
-    cross[..., 0] = np.einsum("ntig,nti->tg", A[..., :d], A[..., d], optimize=True)
-    cross[..., 1:] = np.einsum("ntg,ntk->tgk", A[:, :, 2, :d], F[link], optimize=True)
-    rows = d + OWN * np.arange(T)
-    g[rows] = np.einsum("nti,nti->t", A[..., d], rl)
-    for k in range(OWN):
-        H[:d, rows + k] = cross[..., k].T
-        for m in range(OWN):
-            H[rows + k, rows + m] = own[:, k, m]
-    H[d:, :d] = H[:d, d:].T
-    by_field = np.einsum("ntk,nt->tk", F, r[..., 2], optimize=True) + st.field / noise.field**2
-    for k in range(3):
-        g[rows + 1 + k] = by_field[:, k]
-        L[rows + 1 + k] = np.swapaxes(F[..., k, None] * C[..., 2, :], 0, 1)
-    L[:d, link] = np.einsum("ntig,ntik->gnk", A[..., :d], C[link], optimize=True)
-    L[np.ix_(rows, np.flatnonzero(link))] = np.einsum("nti,ntik->tnk", A[..., d], C[link], optimize=True)
-    Hpp = np.einsum("ntij,ntik->njk", C, C, optimize=True)
-    gp = np.einsum("ntij,nti->nj", C, r, optimize=True)
-    if T > 2 and stiff > 0:
-        D2 = np.diff(np.eye(T), 2, axis=0)
-        bend = stiff * (D2.T @ D2)
-        H[np.ix_(rows, rows)] += bend
-        g[rows] += bend @ st.s
-    return Normal(H, g, Hpp, gp, L)
-
-
-def reduced(n: Normal, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points eliminated: (P, P) information, (P,) gradient, (N, 3, 3) inverse of the points' blocks."""
-    trace = np.trace(n.Hpp, axis1=1, axis2=2)
-    Hpp = n.Hpp + (damping * np.einsum("nii->ni", n.Hpp)[:, :, None] + 1e-9 * (trace + 1e-9)[:, None, None]) * np.eye(3)
-    inverse = np.linalg.inv(Hpp)
-    size = len(n.g)
-    left = np.einsum("anj,njk->ank", n.L, inverse, optimize=True).reshape(size, -1)
-    S = n.H + damping * np.diag(np.diag(n.H)) - left @ n.L.reshape(size, -1).T
-    return S, n.g - left @ n.gp.ravel(), inverse
-
-
-def solve(S: np.ndarray, g: np.ndarray, fixed: int) -> np.ndarray:
-    """Step of the reduced system with one unknown held."""
-    free = np.ones(len(g), bool)
-    free[fixed] = False
-    scale = 1 / np.sqrt(np.maximum(np.diag(S)[free], 1e-30))
-    A = S[np.ix_(free, free)] * scale[:, None] * scale + 1e-12 * np.eye(free.sum())
-    out = np.zeros(len(g))
-    out[free] = -scale * np.linalg.solve(A, scale * g[free])
-    return out
-
-
 def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iterations: int = 10,
            stiff: float | None = None, tolerance: float = 1e-5) -> tuple[State, float]:  # fmt: skip
     """Levenberg-Marquardt with one robust kernel; returns the state and its cost (without the states' prior)."""
@@ -188,9 +89,7 @@ def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iter
         n = normal_equations(st, obs, noise, r, X, cam, w, stiff)
         better = False
         for _ in range(4):
-            S, g, inverse = reduced(n, damping)
-            step = solve(S, g, d + OWN * st.anchor)
-            dp = -np.einsum("njk,nk->nj", inverse, n.gp + np.einsum("anj,a->nj", n.L, step, optimize=True))
+            step, dp = reduced_step(n, damping, d + OWN * st.anchor)
             twist, factor = st.twist.moved(step[:d])
             s = (st.s + step[rows]) * factor
             field = st.field + np.stack([step[rows + 1 + k] for k in range(3)], axis=-1)

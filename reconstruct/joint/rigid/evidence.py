@@ -6,17 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruct.joint.rigid.bundle import (
-    OWN,
-    Normal,
-    State,
-    loose,
-    normal_equations,
-    reduced,
-    refine,
-    residuals,
-    weigh,
-)
+from reconstruct.joint.rigid.bundle import State, loose, refine, residuals, weigh
+from reconstruct.joint.rigid.normal import OWN, covariance, normal_equations
 from reconstruct.joint.rigid.observe import Noise, Observations
 from reconstruct.joint.rigid.twist import KINDS
 
@@ -85,8 +76,7 @@ def _heldout(st: State, obs: Observations, noise: Noise, out: np.ndarray) -> flo
         n = normal_equations(fitted, test, noise, r, X, cam, w, 0.0)
         s, field = fitted.s.copy(), fitted.field.copy()
         for t in np.flatnonzero(~keep):
-            cols = rows[t] + np.arange(OWN)
-            step = -np.linalg.solve(n.H[np.ix_(cols, cols)] + 1e-9 * np.eye(OWN), n.g[cols])
+            step = -np.linalg.solve(n.own[t] + 1e-9 * np.eye(OWN), n.g[rows[t] + np.arange(OWN)])
             s[t] += step[0]
             field[t] += step[1:]
         fitted = State(fitted.twist, s, fitted.points, field, fitted.anchor)
@@ -100,7 +90,8 @@ def _occam(st: State, obs: Observations, noise: Noise, inflation: float) -> floa
         return 0.0
     r, X, cam = residuals(st, obs, noise)
     w, _ = weigh(r, obs, None)
-    cov = joint_covariance(normal_equations(st, obs, noise, r, X, cam, w, loose(st.s)), st) * inflation
+    n = normal_equations(st, obs, noise, r, X, cam, w, loose(st.s))
+    cov = covariance(n, n.d + OWN * st.anchor)[0] * inflation
     stroke = float(np.ptp(st.s))
     B = st.twist.basis()
     v = st.twist.v / max(np.linalg.norm(st.twist.v), 1e-12)
@@ -114,22 +105,3 @@ def _occam(st: State, obs: Observations, noise: Noise, inflation: float) -> floa
         spread = stroke * np.sqrt(max(float(grad @ cov @ grad), 1e-18))
         width += np.log(PITCH_PRIOR * st.twist.size) - np.log(spread)
     return max(float(width), 0.0)
-
-
-def joint_covariance(n: Normal, st: State) -> np.ndarray:
-    """(d, d) covariance of the twist's step, everything else marginalised."""
-    d = st.twist.basis().shape[1]
-    return covariance(n, st)[:d, :d]
-
-
-def covariance(n: Normal, st: State) -> np.ndarray:
-    """(P, P) covariance of joint and frames, points marginalised, the anchor's state held."""
-    S, _, _ = reduced(n)
-    d = st.twist.basis().shape[1]
-    free = np.ones(len(S), bool)
-    free[d + OWN * st.anchor] = False
-    scale = 1 / np.sqrt(np.maximum(np.diag(S)[free], 1e-30))
-    A = S[np.ix_(free, free)] * scale[:, None] * scale
-    out = np.zeros_like(S)
-    out[np.ix_(free, free)] = np.linalg.inv(A + 1e-11 * np.eye(len(A))) * scale[:, None] * scale
-    return out

@@ -7,20 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.joint.models import JointFit
-from reconstruct.joint.rigid.bundle import (
-    CUT,
-    OWN,
-    State,
-    bending,
-    estimate_noise,
-    normal_equations,
-    points_of,
-    refine,
-    residuals,
-    weigh,
-)
-from reconstruct.joint.rigid.evidence import covariance, weigh_types
+from reconstruct.joint.rigid.bundle import CUT, State, bending, estimate_noise, points_of, refine, residuals, weigh
+from reconstruct.joint.rigid.evidence import weigh_types
 from reconstruct.joint.rigid.kabsch import Poses, hypotheses, register
+from reconstruct.joint.rigid.normal import OWN, covariance, normal_equations
 from reconstruct.joint.rigid.observe import Noise, Observations, observe, robust_mean, static_field
 from reconstruct.joint.rigid.twist import KINDS, make
 
@@ -279,23 +269,22 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
     r, X, cam = residuals(st, obs, noise)
     w, _ = weigh(r, obs, None)
     n = normal_equations(st, obs, noise, r, X, cam, w, bending(st.s))
-    cov = covariance(n, st) * correlation(r, w > 0)
-    d = st.twist.basis().shape[1]
+    cov_joint, cov_mixed, cov_states = covariance(n, n.d + OWN * st.anchor)
     link = obs.link & (w.sum(1) >= 2)
     pose0 = st.twist.poses(st.s[:1])[0]
     points = st.points[link] @ pose0[:3, :3].T + pose0[:3, 3]
     centre = np.median(points, axis=0)
     J, axis, point, pitch, rate = _derivatives(st, centre)
     q = rate * (st.s - st.s[0])
-    cov_joint = cov[:d, :d]
     axis_cov = J["axis"] @ cov_joint @ J["axis"].T
     point_cov = None if point is None else J["point"] @ cov_joint @ J["point"].T
-    rows = d + OWN * np.arange(T)
-    Jq = np.zeros((T, len(cov)))
-    Jq[:, :d] = np.outer(st.s - st.s[0], J["rate"])
-    Jq[np.arange(T), rows] += rate
-    Jq[:, rows[0]] -= rate
-    q_std = np.sqrt(np.maximum(np.einsum("ta,ab,tb->t", Jq, cov, Jq, optimize=True), 0))
+    # q_t = rate (s_t - s_0), and the rate changes with the joint.
+    grown = np.outer(st.s - st.s[0], J["rate"])
+    q_var = np.einsum("td,de,te->t", grown, cov_joint, grown) + rate**2 * (cov_states @ [1.0, 1.0, -2.0])
+    q_var += 2 * rate * np.einsum("td,dt->t", grown, cov_mixed - cov_mixed[:, :1])
+    wider = correlation(r, w > 0)
+    axis_cov, q_std = wider * axis_cov, np.sqrt(np.maximum(wider * q_var, 0))
+    point_cov = None if point_cov is None else wider * point_cov
     if q[int(np.argmax(np.abs(q)))] < 0:
         q, axis, pitch = -q, -axis, pitch
     kind = st.twist.kind
