@@ -22,6 +22,7 @@ CERTAIN = 0.9
 AGREE = 0.35
 """Share of the link's observations that has to agree with the joint."""
 SURE = 0.9
+EXCITED = 8.0
 
 
 def fit_rigid(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndarray, T_world_camera: np.ndarray,
@@ -232,17 +233,22 @@ def correlation(r: np.ndarray, good: np.ndarray) -> float:
 
 def _why_not(st: State, obs: Observations, noise: Noise, poses: Poses, world, keys, part) -> str:
     """A reason to refuse, or an empty string."""
-    r, _, _ = residuals(st, obs, noise)
+    r, X, cam = residuals(st, obs, noise)
     inside = np.sum(r**2, axis=-1) < CUT
     link = obs.link[:, None] & obs.seen
     agree = (inside & link).sum() / max(link.sum(), 1)
     made = st.twist.poses(st.s)
     moved = np.einsum("tij,nj->nti", made[:, :3, :3], st.points[obs.link]) + made[:, :3, 3] - st.points[obs.link, None]
-    stroke = float(np.median(np.linalg.norm(moved, axis=-1).max(1)))
+    stroke = float(np.median(np.linalg.norm(moved, axis=-1).max(1)[obs.seen[obs.link].any(1)]))
     z = float(np.median(np.exp(obs.log_depth[obs.ranged])))
-    if stroke * obs.K[0, 0] / z < 3 * noise.px and stroke < 3 * noise.depth * z:
-        return (f"nothing moves: the part's points shift by {stroke * 1e3:.1f} mm, less than their noise; "
-                "film a larger motion")  # fmt: skip
+    # How many standard deviations of a state the states span: pure noise spans five.
+    w, _ = weigh(r, obs, None)
+    info = normal_equations(st, obs, noise, r, X, cam, w, 0.0).own[:, 0, 0]
+    held = info[info > 0]
+    spread = np.sqrt(correlation(r, w > 0) / np.median(held)) if len(held) else np.inf
+    if np.ptp(st.s) < EXCITED * spread:
+        return (f"nothing moves: the part's points shift by {stroke * 1e3:.1f} mm, which is not more than the noise of "
+                "its states; film a larger motion")  # fmt: skip
     # The same points as a free rigid body.
     tolerance = 3 * (np.median(poses.residual) + z * (noise.px / obs.K[0, 0] + 1e-4))
     local = world[np.ix_(part, keys)][:, poses.frames]
