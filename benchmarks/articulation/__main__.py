@@ -3,6 +3,7 @@
     python -m benchmarks.articulation --rows 1 2 --out results.json          # all objects, motions, cameras
     python -m benchmarks.articulation --rows 3 --objects laptop storage --motions open twice --cameras static
     python -m benchmarks.articulation --table results.json                   # the table of results on disk
+    python -m benchmarks.articulation --scaling scaling.png                  # cost over tracks and frames
 
 Every case is a line of JSON in ``--out``; a second run with the same file goes on where the first one stopped.
 """
@@ -102,7 +103,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--focal-unknown", action="store_true", help="row 3: do not give the focal length")
     parser.add_argument("--out", type=Path, help="JSON lines, one a case; appended to")
     parser.add_argument("--table", type=Path, help="print the table of such a file and stop")
+    parser.add_argument("--scaling", type=Path, help="measure the fit's cost over tracks and frames, draw it, and stop")
     args = parser.parse_args(argv)
+    if args.scaling:
+        from benchmarks.articulation.scaling import scaling
+
+        scaling(args.scaling, out=args.out)
+        return 0
     if args.table:
         rows = [json.loads(line) for line in args.table.read_text().splitlines()]
         rows = [r for r in rows if "left_out" not in r]
