@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,15 +11,17 @@ import mujoco
 import numpy as np
 
 from diagnose.causes import CAUSES, Motion
-from diagnose.fit import Fit, Problem
-from diagnose.log import JointLog, LogError, check_units, load_log
+from diagnose.fit import Fit, Problem, linearise
+from diagnose.log import JointLog, LogError, check_units, drop_stale, load_log
+from diagnose.noise import Noise
 from diagnose.plant import Plant, isolated, load_plant
 from diagnose.residual import ljung_box, trim_start, where
 from diagnose.search import Found, Scored, Search, noise_floor
-from diagnose.simulate import Episode, mujoco_rollout, prepare
+from diagnose.simulate import Episode, mujoco_rollouts, prepare, shown
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import written_whole
 
+READING = ("delay", "bias", "gain", "bend2", "bend3", "bend4", "bend5", "play")
 WINDOW = 12.0  # s; longer logs of an imposed motion are cut into windows
 
 
@@ -81,7 +83,7 @@ class Diagnosis:
 
 
 def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = "joint",
-             say: Callable[[str], None] = lambda line: None) -> Diagnosis:  # fmt: skip
+             say: Callable[[str], None] = lambda line: None, only: Sequence[str] | None = None) -> Diagnosis:  # fmt: skip
     """Say what the model gets wrong about a joint, from measured logs.
 
     Args:
@@ -90,6 +92,7 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
             one, every third of its windows.
         joint: name of the joint in the model.
         say: called with a line of progress now and then.
+        only: names of the causes to consider; None for all.
 
     Raises:
         TaaEnvsError: the model or a log cannot be used.
@@ -100,6 +103,8 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
 
         path = get_asset(str(model)).model_path
     plant = load_plant(path, joint)
+    if only is not None and set(only) - set(CAUSES):
+        raise TaaEnvsError(f"no such cause: {', '.join(sorted(set(only) - set(CAUSES)))}; known: {', '.join(CAUSES)}")
     if not logs:
         raise TaaEnvsError("no logs; give at least one CSV with --data")
     read = [log if isinstance(log, JointLog) else load_log(log) for log in logs]
@@ -109,6 +114,10 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
                    "each episode's initial position and velocity are fitted, for the nominal model too"]  # fmt: skip
     episodes, names = [], []
     for log in read:
+        log, stale = drop_stale(log)
+        if stale:
+            assumptions.append(f"{Path(log.name).name}: {stale} rows repeat the position of the row before to the last "
+                               "digit while the part moves; they are left out as stale")  # fmt: skip
         e = prepare(plant, log)
         skip = trim_start(plant, e)
         if skip:
@@ -134,8 +143,8 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
     motion = Motion.of(plant, fitted)
     problem = Problem(plant, fitted, motion, driven)
     held = problem.on([episodes[i] for i in held_at])
-    found = Search(problem, held, say).run()
-    return _verdict(plant, found, problem, held, names, fit_at, held_at, assumptions)
+    found = Search(problem, held, say, only).run()
+    return _verdict(plant, found, found.fitted, found.held, names, fit_at, held_at, assumptions)
 
 
 def is_driven(plant: Plant, episodes: list[Episode]) -> bool:
@@ -180,34 +189,34 @@ def _errors(plant: Plant, scored: Scored, held: Problem, fitted: Problem) -> lis
         return scored.held.residuals
     model = isolated(extended(plant, scored, fitted), plant.joint)
     # The integrator's half-step convention differs from the fit's; its initial states are found anew from the fit's.
-    terms = scored.fit.terms()
+    terms = {k: v for k, v in scored.fit.terms().items() if k in READING}
+    frame = fitted.motion.frame
+    h = model.opt.timestep
     out = []
-    for e, (q0, v0) in zip(held.episodes, scored.held.initial, strict=True):
-        def read(q: float, v: float, e: Episode = e) -> np.ndarray:
-            shown = _late(mujoco_rollout(model, e, q, v), e, terms.get("delay", 0.0))
-            return (1 + terms.get("gain", 0.0)) * shown + terms.get("bias", 0.0)
-
-        x = np.array([q0, v0 + 0.5 * (model.opt.timestep - e.step) * e.a[0]])
-        for _ in range(2):
-            base = read(*x)
-            a, b = 1e-4 * fitted.motion.span, 1e-4 * fitted.motion.speed
-            J = np.stack([(read(x[0] + a, x[1]) - base) / a, (read(x[0], x[1] + b) - base) / b], axis=1)
-            x = x + np.linalg.lstsq(J, e.log.q - base, rcond=None)[0]
-        final = e.log.q - read(*x)
-        base = e.log.q - base
-        out.append(final if final @ final <= base @ base else base)
+    for e, local in zip(held.episodes, scored.held.local, strict=True):
+        slopes = linearise(held.on([e]), scored.fit.candidate, [local], Noise(), []).back[0]
+        x = local.copy()
+        x[1] += 0.5 * (e.step - h) * e.a[0]
+        best = None
+        for _ in range(3):
+            Q, V = mujoco_rollouts(model, e, [x])
+            read = e.log.q - shown(plant, frame, terms, Q[0], V[0], e.t, h)
+            if best is not None and read @ read > 0.999 * (best @ best):
+                best = min(best, read, key=lambda r: float(r @ r))
+                break
+            best = read
+            # The fit's integrator says how the initial state moves the readings.
+            J = (slopes[0] @ slopes[1])[: len(read), :2]
+            x[:2] += np.linalg.lstsq(J, read, rcond=None)[0]
+        out.append(best)
     return out
-
-
-def _late(q: np.ndarray, episode: Episode, delay: float) -> np.ndarray:
-    return q if delay == 0 else np.interp(episode.t - delay, episode.t, q)
 
 
 def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: list[str], fit_at: list[int],
              held_at: list[int], assumptions: list[str]) -> Diagnosis:  # fmt: skip
     best, rivals = found.best, found.rivals
     floor = noise_floor(held)
-    if found.unexplained:
+    if found.left:
         verdict = "unexplained"
     elif not best.causes:
         verdict = "consistent"
@@ -250,8 +259,9 @@ def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: 
         "episodes": {"fit": [names[i] for i in fit_at], "heldout": [names[i] for i in held_at]},
         "extended_model": None, "assumptions": assumptions, "unit": unit,
         "whiteness": {"ljung_box": whiteness[0], "p": whiteness[1]},
-        "ranking": [{"causes": list(s.causes), "nats": found.best.score - s.score, "heldout_rmse": s.held.rmse}
-                    for s in found.ranking[:12]],
+        "ranking": [{"causes": list(f.causes), "nats": f.nats - found.ranking[0].nats, "rmse": f.rmse}
+                    for f in found.ranking[:12]],
+        "noise": {"std": found.noise.std, "phi": found.noise.phi, "theta": found.noise.theta},
     }  # fmt: skip
     result = Diagnosis(verdict, data, plant, found, fitted, held)
     for i, e, n, x in zip(held_at, held.episodes, nominal, after, strict=True):
@@ -278,13 +288,10 @@ def _cause(name: str, fit: Fit, found: Found, plant: Plant, middle: float) -> di
         s = float(np.sqrt(max(g @ fit.cov[index : index + 2, index : index + 2] @ g, 0)))
         parameters.pop("torque_at_middle")
         parameters["rest"] = {"value": rest, "unit": plant.unit, "ci95": [rest - 1.96 * s, rest + 1.96 * s]}
-    rest_of = tuple(n for n in fit.causes if n != name)
-    without = next((s for s in found.ranking if s.causes == rest_of), None)
-    evidence = {"sentence": CAUSES[name].sentence, "z": fit.z(name)}
-    if without is not None:
-        evidence |= {"nats_fit": without.bic - found.best.bic,
-                     "nats_heldout": found.best.held_loglik - without.held_loglik,
-                     "heldout_rmse_without": without.held.rmse}  # fmt: skip
+    without = found.without[name]
+    evidence = {"sentence": CAUSES[name].sentence, "z": fit.z(name), "nats_fit": without.fit.nats - fit.nats,
+                "nats_heldout": 0.5 * (without.held.chi2 - found.best.held.chi2),
+                "heldout_rmse_without": without.held.rmse}  # fmt: skip
     return {"name": name, "parameters": parameters, "evidence": evidence}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,7 @@ class JointLog:
     torque: np.ndarray | None = None
     force: np.ndarray | None = None
     point: np.ndarray | None = None
+    markers: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for key in ("time", "q", "torque", "force", "point"):
@@ -128,3 +129,33 @@ def check_units(log: JointLog, hinge: bool, model_range: tuple[float, float] | N
     if span > wide:
         unit, other, factor = ("rad", "degrees", "pi/180") if hinge else ("m", "millimetres", "1/1000")
         raise LogError(f"{log.name}: q spans {span:.3g} {unit}, which looks like {other}; multiply q by {factor}")
+
+
+def drop_stale(log: JointLog) -> tuple[JointLog, int]:
+    """Leave out rows whose position is that of the row before although the part moves on.
+
+    A reader that is asked faster than its sensor answers, or that missed an answer, repeats itself to the last digit.
+    Where positions are rounded coarsely, equal neighbours are ordinary: nothing is left out if readings of one in
+    five moving rows repeat anyway or if the position takes few values.
+
+    Returns:
+        the log and how many rows were left out.
+    """
+    from diagnose.simulate import smooth
+
+    same = np.concatenate([[False], np.diff(log.q) == 0])
+    values = np.unique(log.q)
+    if not same.any() or len(values) < 0.5 * len(log.q):
+        return log, 0
+    grain = float(np.median(np.diff(values)[np.diff(values) > 0]))
+    speed = np.abs(smooth(log.time, log.q)[1])
+    moving = speed * np.concatenate([[log.dt], np.diff(log.time)]) > 4 * grain
+    stale = same & moving
+    if stale.sum() > 0.2 * max(moving.sum(), 1):
+        return log, 0
+    # At rest a repeat is as stale, but cannot be told from an unmoving reading that has no noise.
+    if stale.any():
+        stale |= same & (np.diff(np.concatenate([log.q[:1], log.q])) == 0) & (len(values) > 0.8 * len(log.q))
+    keep = ~stale
+    return replace(log, **{k: getattr(log, k)[keep] for k in ("time", "q", "torque", "force", "point", "markers")
+                           if getattr(log, k) is not None}), int(stale.sum())  # fmt: skip

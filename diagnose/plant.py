@@ -49,6 +49,14 @@ class Plant:
     limits: tuple[float, float] | None
     timestep: float
 
+    def row(self) -> tuple[np.ndarray, np.ndarray]:
+        """The joint as numbers for :mod:`diagnose.kernel`: (16,) and the table of static torques (M,)."""
+        low, high = self.limits if self.limits is not None else (0.0, 0.0)
+        grid, table = self.static_table if self.static_table is not None else (np.zeros(2), np.zeros(2))
+        return np.array([self.inertia, *(self.gravity if self.hinge else (0.0, 0.0, self.gravity[2])), self.stiffness,
+                         self.springref, *self.damping, self.frictionloss, self.limits is not None, low, high,
+                         self.static_table is not None, grid[0], grid[1] - grid[0]], float), table  # fmt: skip
+
     @property
     def unit(self) -> str:
         return "rad" if self.hinge else "m"

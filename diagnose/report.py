@@ -49,8 +49,8 @@ def page(result: Diagnosis) -> str:
         ("noise floor", f"{d['noise_floor']:.4g}"),
         ("ratio", f"{g['heldout_rmse_ratio']:.3g} ({g['ci95'][0]:.3g} to {g['ci95'][1]:.3g})")]),
         _image(_over_time(result)), "<h2>Where the nominal model's error lives</h2>", _image(_in_plane(result)),
-        "<h2>What was tried</h2>", _table(("causes", "nats behind the chosen", f"held-out error, {u}"), [
-            (" + ".join(r["causes"]) or "nothing", f"{r['nats']:.1f}", f"{r['heldout_rmse']:.4g}")
+        "<h2>What was tried</h2>", _table(("causes", "nats behind the chosen", f"error of the fitted episodes, {u}"), [
+            (" + ".join(r["causes"]) or "nothing", f"{r['nats']:.1f}", f"{r['rmse']:.4g}")
             for r in d["ranking"]]),
         "<h2>Assumptions</h2><ul>", *(f"<li>{html.escape(a)}</li>" for a in d["assumptions"]), "</ul>"]  # fmt: skip
     return (f"<!doctype html><html lang=en><meta charset=utf-8><title>Diagnosis</title><style>{STYLE}</style>"

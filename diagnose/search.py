@@ -1,29 +1,31 @@
-"""Which causes? Forward search with backward pruning and swaps, then the question what else would do as well.
+"""Which causes? Best subsets of a regression, fits of the best of them, then the question what else would do as well.
 
-A set of causes is preferred by the Bayesian criterion of the whitened residual. A cause stays only if, without it,
-both the fitted and the held-out episodes become clearly less likely and its parameters are clearly not zero.
+A set of causes is preferred by the Bayesian criterion of the whitened residual, all sets under the noise that the best
+of them leaves (:mod:`diagnose.noise`). A cause stays only if, without it, both the fitted and the held-out episodes
+become clearly less likely and the held-out error clearly larger.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from diagnose.causes import CAUSES, UNNAMED
-from diagnose.fit import Candidate, Fit, Problem, fit_many, starts, whiten
-from diagnose.simulate import KNOTS
+from diagnose.fit import Candidate, Fit, Problem, bounds, fit, scales
+from diagnose.noise import Excess, Noise, estimate, excess
+from diagnose.screen import Guess, Regression, shortlist, tangents
+from diagnose.simulate import FINE, SHORT
 
 MOST = 4  # causes in a set
 FIT_MARGIN = 8.0  # nats of the Bayesian criterion on the fitted episodes
 HELD_MARGIN = 3.0  # nats of log-likelihood on the held-out episodes
 HELD_GAIN = 0.98  # of the held-out error without the cause
-SURE = 4.0  # standard deviations from nothing
 RIVAL = 4.0  # nats within which two sets explain equally well
-KEEP = 6  # candidates that go from windows to whole episodes
-NOISY = 3.4  # times the floor that fast changes show, is the most that slow noise may add up to
-PIECES = 10  # windows of an episode in the first stage of a fit
+TOP = 5  # sets of one size that are fitted
+ROUNDS = 4  # of looking around the best set
+SHARP = ("stribeck_friction", "end_stop", "detent")  # want short steps
 
 
 @dataclass
@@ -31,18 +33,12 @@ class Scored:
     """A fit with its judgement.
 
     Attributes:
-        fit, held: on the two groups of episodes; of the held-out ones only the initial states are fitted.
-        bic: half the Bayesian criterion on the fitted episodes, nats.
-        held_loglik: of the held-out episodes under the fit's noise model.
-
-    Both count an error beyond :data:`NOISY` times the noise floor at a tenth of its samples' worth: an autoregression
-    follows any smooth error, and such an error is no noise.
+        fit, held: on the two groups of episodes; of the held-out ones only their own unknowns are fitted.
+        score: nats of both, smaller is better.
     """
 
     fit: Fit
     held: Fit
-    bic: float
-    held_loglik: float
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -50,8 +46,7 @@ class Scored:
 
     @property
     def score(self) -> float:
-        """Nats, larger is better."""
-        return -self.bic + self.held_loglik
+        return self.fit.nats + 0.5 * self.held.chi2
 
 
 @dataclass
@@ -59,20 +54,26 @@ class Found:
     """What the search says.
 
     Attributes:
-        best: the chosen set (maybe empty).  nominal: the empty set.
-        rivals: sets that explain as well.  ranking: every set that was tried, best first.
-        free: the best set with free torques over q and over velocity beside it.
-        unexplained: True if something is left that the library does not explain.
-        left: why, in words.
+        best: the chosen set (maybe empty).  nominal: the empty set.  noise: of the measurement.
+        fitted, held: the two groups of episodes, in the steps that the fits were made with.
+        rivals: sets that explain as well.  without: of each chosen cause, the best set's remainder.
+        ranking: every set that was fitted under the final noise, best first.
+        free: the best set with free torques over q and over velocity beside it; None if nothing asked for it.
+        left: why something is left that the library does not explain; empty if nothing is.
+        excess: slow residual beyond the noise.
     """
 
     best: Scored
     nominal: Scored
+    noise: Noise
+    fitted: Problem
+    held: Problem
     rivals: list[Scored] = field(default_factory=list)
-    ranking: list[Scored] = field(default_factory=list)
+    without: dict[str, Scored] = field(default_factory=dict)
+    ranking: list[Fit] = field(default_factory=list)
     free: Scored | None = None
-    unexplained: bool = False
     left: str = ""
+    excess: Excess | None = None
 
 
 class Search:
@@ -81,181 +82,208 @@ class Search:
     Args:
         fitted, held: the problem on the two groups of episodes.
         say: called with a line at each step.
+        only: names of the causes to consider; None for all.
     """
 
-    def __init__(self, fitted: Problem, held: Problem, say: Callable[[str], None] = lambda line: None) -> None:
+    def __init__(self, fitted: Problem, held: Problem, say: Callable[[str], None] = lambda line: None,
+                 only: Iterable[str] | None = None) -> None:  # fmt: skip
         self.fitted, self.held, self.say = fitted, held, say
-        self.floor = noise_floor(fitted)
-        self.done: dict[tuple[str, ...], Scored] = {}
+        self.coarse = fitted
+        self.smallest = rounding(fitted) / np.sqrt(12)
+        self.noise = self.generous = Noise(k=noise_floor(fitted))
+        self.done: dict[tuple[str, ...], Fit] = {}
+        self.judged: dict[tuple[str, ...], Fit] = {}
         skip = set()
         if not fitted.plant.hinge:
             skip |= {n for n, c in CAUSES.items() if c.hinge_only}
         inputs = np.concatenate([e.u for e in fitted.episodes])
         if fitted.driven or np.ptp(inputs) == 0:
             skip |= {"time_delay"}  # without an input (or with the position as input) a delay is a later start
-        if fitted.driven:
-            skip |= {"inertia", "sensor_bias", "sensor_gain", "sensor_distortion"}  # not shown by slow motion
-        self.names = [n for n in CAUSES if n not in skip]
-
-    def score(self, sets: list[tuple[str, ...]], known: dict[str, float] | None = None, keep: int | None = None
-              ) -> list[Scored]:  # fmt: skip
-        """Fit the sets that were not fitted yet, all together; with ``keep``, only the most promising starts."""
-        sets = [_sorted(s) for s in sets]
-        new = [s for s in dict.fromkeys(sets) if s not in self.done]
-        candidates = []
-        for s in new:
-            single = s in ((n,) for n in self.names)
-            candidates += starts(self.fitted, s, known, most=2 if single else 1) if s else [Candidate((), np.zeros(0))]
-            if known and s:  # the regression knows better than the smaller set what its terms are beside each other
-                candidates += starts(self.fitted, s, None, most=1)
-        fits = fit_many(self.fitted, candidates, pieces=PIECES, keep=keep)
-        best: dict[tuple[str, ...], Fit] = {}
-        for f in fits:
-            if f.causes not in best or f.bic() + self.gross(f) < best[f.causes].bic() + self.gross(best[f.causes]):
-                best[f.causes] = f
-        new = [s for s in new if s in best]
-        if new:
-            chosen = [best[s] for s in new]
-            held = fit_many(self.held, [f.candidate for f in chosen], iterations=5, whitened=0, fixed=True,
-                            pieces=0)  # fmt: skip
-            for s, f, h in zip(new, chosen, held, strict=True):
-                self.done[s] = self._scored(f, h)
-        return [self.done[s] for s in sets if s in self.done]
-
-    def gross(self, fit: Fit) -> float:
-        """Nats that a fit's error costs beyond what can be noise."""
-        return 0.1 * fit.n * max(0.0, float(np.log(fit.rmse / (NOISY * self.floor))))
-
-    def _scored(self, fit: Fit, held: Fit) -> Scored:
-        return Scored(fit, held, fit.bic() + self.gross(fit), _loglik(held, fit) - self.gross(held))
+        if fitted.driven:  # not shown by slow motion
+            skip |= {"inertia", "sensor_bias", "sensor_gain", "sensor_distortion", "backlash"}
+        self.names = [n for n in CAUSES if n not in skip and (only is None or n in only)]
 
     def run(self) -> Found:
-        nominal = self.score([()])[0]
-        current = nominal
-        for size in range(1, MOST + 1):
-            grown = [s for n in self.names if (s := _with(current.causes, n)) is not None]
-            if size == 1:  # hardly anything moves without some friction, and what else is wrong shows only beside it
-                grown += [s for rub in ("viscous_damping", "coulomb_friction") for n in self.names
-                          if (s := _with((rub,), n)) is not None and len(s) == 2]  # fmt: skip
-            known = current.fit.terms()
-            trials = self.score(grown, known, keep=KEEP if size > 1 else 2 * KEEP)
-            # Far from the noise, what leaves the smallest error comes first; near it, what is likeliest.
-            picks = {id(t): t for t in (max(trials, key=lambda t: t.score), min(trials, key=lambda t: t.fit.rss))}
-            swapped = [t for p in picks.values() for t in self._swaps(p, grown=size > 1)]
-            best = max([*picks.values(), *swapped], key=lambda t: t.score)
-            best = self._polish(self._prune(best))
-            if current.bic - best.bic < FIT_MARGIN or best.held_loglik - current.held_loglik < HELD_MARGIN:
+        self._start()
+        best = self._best()
+        for _ in range(ROUNDS):
+            self._listen(best)
+            self._look_around(best)
+            now = self._best()
+            if now.causes == best.causes:
                 break
-            self.say(f"{' + '.join(best.causes)}: error {best.fit.rmse:.4g}, held out {best.held.rmse:.4g}")
-            if set(best.causes) == set(current.causes):
-                break
-            current = best
-        current = self._sure(current)
-        found = Found(current, nominal)
-        found.rivals = self._rivals(current)
-        found.free, found.unexplained, found.left = self._left(current)
-        found.ranking = sorted(self.done.values(), key=lambda s: -s.score)
+            self.say(f"{' + '.join(now.causes)}: error {now.rmse:.4g}")
+            best = now
+        best = self._sure(self._best())
+        self._listen(best)
+        self._look_around(best, rivals=True)
+        scored = self._judge(best.causes)
+        found = Found(scored, self._judge(()), self.noise, self.fitted, self.held)
+        found.without = {n: self._judge(_less(best.causes, n)) for n in best.causes}
+        found.rivals = self._rivals(scored)
+        self._left(found)
+        found.ranking = sorted(self.done.values(), key=lambda f: f.nats)
         return found
 
-    def _swaps(self, base: Scored, grown: bool) -> list[Scored]:
-        """The set with each of its causes replaced by each other one."""
-        if not grown:
-            return []
-        sets = []
-        for old in base.causes:
-            rest = tuple(n for n in base.causes if n != old)
-            wider = [_with(rest, n) for n in self.names if n != old]
-            sets += [s for s in wider if s is not None and len(s) == len(rest) + 1]
-        return self.score(sets, keep=KEEP)
+    # Fits
 
-    def _prune(self, best: Scored) -> Scored:
-        """Drop causes whose absence the criterion does not mind."""
-        while len(best.causes) > 1:
-            smaller = self.score([tuple(n for n in best.causes if n != old) for old in best.causes])
-            top = max(smaller, key=lambda s: s.score)
-            if top.bic - best.bic >= FIT_MARGIN and top.held_loglik <= best.held_loglik - HELD_MARGIN:
-                return best
-            best = top
-        return best
+    def _fit(self, guesses: Iterable[Guess]) -> None:
+        """Fit the sets of some guesses under the present noise; of a set that was fitted, only a better fit counts."""
+        known = set(self.done)
+        for g in guesses:
+            key = _sorted(g.causes)
+            if key in known:
+                continue
+            f = fit(self.fitted, _candidate(self.fitted, key, g.values), self.noise)
+            if key not in self.done or f.chi2 < self.done[key].chi2:
+                self.done[key] = f
 
-    def _polish(self, best: Scored) -> Scored:
-        """Fit the chosen set to the end; the search only goes as far as it needs to compare."""
-        if not best.causes:
-            return best
-        f = fit_many(self.fitted, [best.fit.candidate], iterations=25,
-                     initial=[None if self.fitted.driven else best.fit.initial])[0]  # fmt: skip
-        h = fit_many(self.held, [f.candidate], iterations=5, whitened=0, fixed=True)[0]
-        better = self._scored(f, h)
-        if better.score <= best.score:
-            return best
-        self.done[best.causes] = better
-        return better
+    def _best(self) -> Fit:
+        return min(self.done.values(), key=lambda f: f.nats)
 
-    def _sure(self, best: Scored) -> Scored:
-        """Keep only causes that are clearly not zero and that improve the held-out episodes beyond the margin."""
+    def _start(self) -> None:
+        regression = Regression(self.fitted)
+        lists = shortlist(self.fitted, *regression.blocks(self.names), regression.y, MOST, TOP)
+        leaves = {k: guesses[0].rss for k, guesses in lists.items() if guesses}
+        most = max(leaves)
+        size = next(k for k in sorted(leaves) if leaves[k] <= 1.2 * leaves[most])
+        self._fit([Guess((), {}, 0.0)])
+        for k in range(max(size - 1, 1), min(size + 1, most) + 1):
+            self._fit(regression.refine(g) for g in lists.get(k, []))
+
+    def _listen(self, best: Fit) -> None:
+        """Take the noise that the best set leaves, and fit again under it what may still compete."""
+        old = self.noise
+        before, step = self.fitted, SHORT if set(best.causes) & set(SHARP) else FINE
+        sharpen = not before.driven and before.episodes[0].step > step + 1e-9
+        if sharpen:
+            self.fitted, self.held = before.stepped(step), self.held.stepped(step)
+            best = fit(self.fitted, best.candidate, self.noise, iterations=6,
+                       local=self.fitted.moved(best.local, before))  # fmt: skip
+        self.noise, self.generous = estimate(best.residuals, self.smallest)
+        if not sharpen and abs(self.noise.std / old.std - 1) < 0.03 and abs(self.noise.phi - old.phi) < 0.02:
+            self.noise = old
+            return
+        fits, self.done, self.judged = list(self.done.values()), {}, {}
+        cost = [0.5 * sum(float(np.sum(self.noise.whiten(r) ** 2)) for r in f.residuals)
+                + 0.5 * len(f.candidate.theta) * np.log(f.n) for f in fits]  # fmt: skip
+        order = np.argsort(cost)
+        for i in order:
+            f = fits[i]
+            if cost[i] > cost[order[0]] + 60 and f.causes:
+                continue
+            local = self.fitted.moved(f.local, before) if sharpen else f.local
+            self.done[f.causes] = fit(self.fitted, f.candidate, self.noise, local=local, iterations=6)
+
+    def _look_around(self, best: Fit, rivals: bool = False) -> None:
+        """Fit the sets near the best one that its derivatives say might do as well or better."""
+        local = self.coarse.moved(best.local, self.fitted)
+        groups, F, y = tangents(self.coarse, best, local, self.noise, self.names)
+        most = min(len(best.causes) + (not rivals), MOST)
+        lists = shortlist(self.fitted, groups, F, y, max(most, 1), 10)
+        here = 0.5 * lists_rss(lists, best.causes, best.chi2)
+        wanted = []
+        for guesses in lists.values():
+            for g in guesses:
+                count = sum(len(CAUSES[n].parameters) for n in g.causes)
+                gap = 0.5 * g.rss - here + 0.5 * (count - len(best.candidate.theta)) * np.log(best.n)
+                if gap < 15.0 and _sorted(g.causes) not in self.done:
+                    wanted.append((gap, g))
+        wanted.sort(key=lambda w: w[0])
+        self._fit(g for _, g in wanted[:8])
+
+    def _judge(self, causes: tuple[str, ...]) -> Scored:
+        """A set with its held-out episodes under the present noise."""
+        if causes not in self.done:
+            best = self._best()
+            self.done[causes] = fit(self.fitted, _candidate(self.fitted, causes, best.terms()), self.noise,
+                                    local=best.local)  # fmt: skip
+        f = self.done[causes]
+        if causes not in self.judged:
+            self.judged[causes] = fit(self.held, f.candidate, self.noise, iterations=6, fixed=True)
+        return Scored(f, self.judged[causes])
+
+    # Judgements
+
+    def _sure(self, best: Fit) -> Fit:
+        """Keep only causes that are clearly there and that improve the held-out episodes beyond the margin."""
         while best.causes:
-            drop = None
+            full = self._judge(best.causes)
+            losses = []
             for name in best.causes:
-                without = self.score([tuple(n for n in best.causes if n != name)])[0]
-                helps = (without.held_loglik <= best.held_loglik - HELD_MARGIN
-                         and without.bic - best.bic >= FIT_MARGIN
-                         and best.held.rmse <= HELD_GAIN * without.held.rmse)  # fmt: skip
-                if best.fit.z(name) < SURE or not helps:
-                    drop = without
-                    break
-            if drop is None:
+                without = self._judge(_less(best.causes, name))
+                helps = (without.fit.nats - full.fit.nats >= FIT_MARGIN
+                         and 0.5 * (without.held.chi2 - full.held.chi2) >= HELD_MARGIN
+                         and full.held.rmse <= HELD_GAIN * without.held.rmse)  # fmt: skip
+                losses.append((helps, without.score, without))
+                for special in CAUSES[name].contains:  # a special case of the cause may do as well
+                    plain = self._judge(_sorted((*_less(best.causes, name), special)))
+                    losses.append((plain.fit.nats - full.fit.nats >= FIT_MARGIN, plain.score, plain))
+            worst = min(losses, key=lambda x: (x[0], x[1]))
+            if worst[0]:
                 return best
-            best = drop
+            best = worst[2].fit
         return best
 
     def _rivals(self, best: Scored) -> list[Scored]:
         """Other sets, no larger, that explain the data as well and do not contain the chosen one."""
         if not best.causes:
             return []
-        if len(best.causes) == 1:  # pairs may have crowded single causes out of the first round
-            self.score([(n,) for n in self.names])
-        else:
-            self._swaps(best, grown=True)
-        extra = set(best.causes)
-        out = [s for c, s in self.done.items()
-               if c and not extra <= set(c) and len(s.fit.candidate.theta) <= len(best.fit.candidate.theta) + 1
-               and len(c) <= len(best.causes) and not _contains(c, best.causes)
-               and best.score - s.score < RIVAL
-               and all(s.fit.z(n) > 2 for n in c)]  # fmt: skip
-        return sorted(out, key=lambda s: -s.score)[:8]
+        out = []
+        for causes, f in self.done.items():
+            if (not causes or len(causes) > len(best.causes) or _contains(causes, best.causes)
+                    or len(f.candidate.theta) > len(best.fit.candidate.theta) + 1
+                    or f.nats - best.fit.nats > RIVAL + 10.0):  # fmt: skip
+                continue
+            other = self._judge(causes)
+            gap = 0.5 * (f.chi2 - best.fit.chi2 + other.held.chi2 - best.held.chi2)
+            if gap < RIVAL and all(f.z(n) > 2 for n in causes):
+                out.append(other)
+        return sorted(out, key=lambda s: s.score)[:8]
 
-    def _left(self, best: Scored) -> tuple[Scored | None, bool, str]:
-        """Is anything left? Free torques over q and velocity are given the chance to show it."""
-        c = best.fit.candidate
-        start = Candidate(c.causes, np.concatenate([c.theta, np.zeros(2 * KNOTS)]), spline=True)
-        f = fit_many(self.fitted, [start], initial=[None if self.fitted.driven else best.fit.initial])[0]
-        h = fit_many(self.held, [f.candidate], iterations=5, whitened=0, fixed=True)[0]
-        free = self._scored(f, h)
-        gain = free.held_loglik - best.held_loglik
-        ratio = free.held.rmse / best.held.rmse
-        if gain > 2 * HELD_MARGIN and ratio < 0.9 and best.bic - free.bic > FIT_MARGIN:
-            return free, True, ("free torques over position and velocity cut the held-out error to "
-                                f"{ratio:.2f} of what the named causes leave")  # fmt: skip
+    def _left(self, found: Found) -> None:
+        """Is anything left? Slow residual beyond the noise says so, and free torques over q and velocity."""
+        best = found.best
         if set(best.causes) & set(UNNAMED):
-            return free, True, "the position reading itself is bent: its scale changes over the range"
-        floor = self.floor
-        if best.fit.rmse > NOISY * floor and lasting(best.fit.residuals) > 0.4:
-            return free, True, (f"the error left is {best.fit.rmse / floor:.1f} times the noise and smooth, and no "
-                                "torque that depends on position and velocity explains it")  # fmt: skip
-        return free, False, ""
+            found.left = "the position reading itself is bent: its scale changes over the range"
+        residuals = best.fit.residuals + best.held.residuals
+        _, generous = estimate(residuals, self.smallest)
+        found.excess = excess(residuals, generous)
+        if found.excess.sigmas < 3.0 and not found.left:
+            return
+        f = fit(self.fitted, best.fit.candidate, self.noise, iterations=6, local=best.fit.local, spline=True)
+        h = fit(self.held, f.candidate, self.noise, iterations=6, fixed=True)
+        found.free = Scored(f, h)
+        ratio = h.rmse / best.held.rmse
+        if 0.5 * (best.held.chi2 - h.chi2) > 2 * HELD_MARGIN and ratio < 0.9:
+            found.left = found.left or ("free torques over position and velocity cut the held-out error to "
+                                        f"{ratio:.2f} of what the named causes leave")  # fmt: skip
+        elif found.excess.there:
+            found.left = found.left or (f"slow errors of {found.excess.share:.1f} times the noise are left, and no "
+                                        "torque that depends on position and velocity explains them")  # fmt: skip
+
+def lists_rss(lists: dict[int, list[Guess]], causes: tuple[str, ...], default: float) -> float:
+    """What the regression says that a set leaves."""
+    same = [g.rss for g in lists.get(len(causes), []) if set(g.causes) == set(causes)]
+    return min(same, default=default)
 
 
 def noise_floor(problem: Problem) -> float:
-    """Standard deviation of the measurement noise, from the data alone: what a local cubic over 13 samples leaves,
-    corrected for the freedom of the cubic; never below a rounding step / sqrt(12)."""
+    """Standard deviation of what is fast in the measurement, from the data alone: what a local cubic over 13 samples
+    leaves, corrected for the freedom of the cubic; never below a rounding step / sqrt(12)."""
     e = np.concatenate([(ep.u if problem.driven else ep.log.q) - _again(ep, problem.driven) for ep in problem.episodes])
-    values = np.sort(np.concatenate([np.unique(ep.u if problem.driven else ep.log.q) for ep in problem.episodes]))
+    # The centre of a cubic over 13 points takes 0.175 of the noise's variance with it.
+    white = 1.4826 * float(np.median(np.abs(e))) / np.sqrt(1 - 0.175)
+    return max(white, rounding(problem) / np.sqrt(12), 1e-9 * problem.motion.span, 1e-12)
+
+
+def rounding(problem: Problem) -> float:
+    """The measurement's rounding step, 0 if none shows."""
+    y = np.concatenate(problem.measured)
+    values = np.unique(y)
     steps = np.diff(values)
     steps = steps[steps > 1e-9]
-    rounding = float(np.median(steps)) if len(steps) and len(values) < 0.5 * len(e) else 0.0
-    # The centre of a cubic over 13 points takes 4 x 1/13 x 9/4 of the noise's variance with it.
-    white = 1.4826 * float(np.median(np.abs(e))) / np.sqrt(1 - 0.175)
-    return max(white, rounding / np.sqrt(12), 1e-12)
+    return float(np.median(steps)) if len(steps) and len(values) < 0.5 * len(y) else 0.0
 
 
 def _again(ep, driven: bool) -> np.ndarray:
@@ -266,25 +294,14 @@ def _again(ep, driven: bool) -> np.ndarray:
     return smooth(ep.t, ep.u)[0]
 
 
-def lasting(residuals: list[np.ndarray], lag: int = 5) -> float:
-    """Correlation of the residual with itself a few samples later; noise has lost most of it by then."""
-    pairs = [(r[lag:], r[:-lag]) for r in residuals]
-    top = sum(float(a @ b) for a, b in pairs)
-    return top / max(sum(0.5 * float(a @ a + b @ b) for a, b in pairs), 1e-300)
-
-
-def _loglik(held: Fit, fit: Fit) -> float:
-    """Of held-out residuals under the noise that the fit found."""
-    w = np.concatenate([whiten(r, fit.phi) for r in held.residuals])
-    s2 = fit.innovation**2
-    return float(-0.5 * len(w) * np.log(2 * np.pi * s2) - 0.5 * (w @ w) / s2)
-
-
-def _with(causes: tuple[str, ...], name: str) -> tuple[str, ...] | None:
-    """The set with one more cause; special cases give way to what contains them; None if nothing changes."""
-    if name in causes or any(name in CAUSES[c].contains for c in causes):
-        return None
-    return _sorted((*[c for c in causes if c not in CAUSES[name].contains], name))
+def _candidate(problem: Problem, causes: tuple[str, ...], values: dict[str, float]) -> Candidate:
+    """A start; a parameter that must not be negative starts off its bound, else its slope is all the fit sees of it."""
+    empty = Candidate(causes, np.zeros(0))
+    parameters = empty.parameters()
+    lo, hi = bounds(parameters, problem.motion) if parameters else (np.zeros(0), np.zeros(0))
+    unit = scales(parameters, problem.motion)
+    theta = np.clip([values.get(p.term, 0.0) for p in parameters], lo, hi)
+    return replace(empty, theta=np.where(theta <= lo, np.minimum(lo + 0.05 * unit, hi), theta))
 
 
 def _contains(larger: tuple[str, ...], smaller: tuple[str, ...]) -> bool:
@@ -292,6 +309,13 @@ def _contains(larger: tuple[str, ...], smaller: tuple[str, ...]) -> bool:
     return all(c in larger or any(c in CAUSES[x].contains for x in larger) for c in smaller)
 
 
-def _sorted(causes: tuple[str, ...]) -> tuple[str, ...]:
+def _less(causes: tuple[str, ...], name: str) -> tuple[str, ...]:
+    return tuple(c for c in causes if c != name)
+
+
+def _sorted(causes: Iterable[str]) -> tuple[str, ...]:
     order = list(CAUSES)
     return tuple(sorted(causes, key=order.index))
+
+
+__all__ = ["Found", "Scored", "Search", "noise_floor", "rounding"]

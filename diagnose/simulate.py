@@ -1,28 +1,27 @@
-"""The joint under a log's own inputs, many variants of it at once.
+"""Logs made ready for simulation, and the joint under a log's own inputs, many variants of it at once.
 
-One time loop advances all columns (variant x episode x perturbed parameter) together; a variant is the nominal joint
-plus the terms of :data:`TERMS`. The scheme is leapfrog with damping at the middle of the step and dry friction in the
-limit of hard constraints: what MuJoCo computes for one degree of freedom, without its errors of first order in the
-time step. :func:`mujoco_rollout` is MuJoCo itself, for the numbers that are reported.
+:func:`readings` is the fit's own integrator (:mod:`diagnose.kernel`); :func:`mujoco_rollouts` is MuJoCo itself, for the
+numbers that are reported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
+from diagnose import kernel
+from diagnose.kernel import KNOTS, TERMS
 from diagnose.log import JointLog
 from diagnose.plant import Plant
 
-#: Terms a variant may add to the nominal joint, all 0 by default.
-TERMS = ("damping", "drag", "coulomb", "stiction", "stribeck_velocity", "stiffness", "spring_torque", "torque",
-         "gravity_sin", "gravity_cos", "inertia", "stop_place", "stop_stiffness", "stop_damping",
-         "detent_strength", "detent_place", "detent_width", "delay", "bias", "gain", "bend", "twist")  # fmt: skip
-KNOTS = 9
-MAX_STEP = 5e-3  # s
+COARSE, FINE, SHORT = 5e-3, 2.5e-3, 1.25e-3  # s, longest step of a search, of what is reported, of sharp causes
+EVEN = 0.02  # rows further apart than the median by more than this share leave open when a held input changed
+
+__all__ = ["COARSE", "FINE", "KNOTS", "SHORT", "TERMS", "Episode", "Frame", "held", "mujoco_rollouts", "prepare",
+           "readings", "smooth", "windows"]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,8 @@ class Episode:
     Attributes:
         log: the measurement.  t: (N,) s from its start.
         step: s.  torque: (K,) input over each step.
-        q0, v0: a smoothed guess of the initial state.
+        edges: (M, K) what each change of a held input adds if it happened one row earlier; only of changes between
+            rows that are not evenly spaced, where nobody knows when between the two rows the input changed.
         q, v, a: (N,) smoothed position, velocity, acceleration.  u: (N,) input at the samples.
     """
 
@@ -40,12 +40,20 @@ class Episode:
     t: np.ndarray
     step: float
     torque: np.ndarray
-    q0: float
-    v0: float
+    edges: np.ndarray
     q: np.ndarray
     v: np.ndarray
     a: np.ndarray
     u: np.ndarray
+
+    @property
+    def start(self) -> np.ndarray:
+        """(2 + M,) guess of what is unknown of this episode alone: initial q and v (half a step early), edges."""
+        return np.concatenate([[self.q[0], self.v[0] - 0.5 * self.step * self.a[0]], np.full(len(self.edges), 0.5)])
+
+    def stepped(self, most: float) -> Episode:
+        """The same with steps of at most so many seconds."""
+        return _on_grid(self, most)
 
 
 def held(u: np.ndarray) -> bool:
@@ -53,19 +61,37 @@ def held(u: np.ndarray) -> bool:
     return bool(np.mean(np.diff(u) == 0) > 0.5)
 
 
-def prepare(plant: Plant, log: JointLog, most: float = MAX_STEP) -> Episode:
+def prepare(plant: Plant, log: JointLog, most: float = COARSE) -> Episode:
     """Put a log's input on a fine even grid and smooth its motion.
 
     An input that is constant between most samples (a held torque, let go) acts from its row's time until the next
     row's; any other is interpolated, but a fall to exactly 0 (letting go) stays a jump.
     """
     t = log.time - log.time[0]
-    step = log.dt / max(1, int(np.ceil(log.dt / most - 1e-9)))
-    count = int(np.ceil(t[-1] / step - 1e-9)) + 1
     u = plant.input_torque(log)
-    torque = sum(_input_at(t, u, (np.arange(count) + s) * step) for s in SPREAD) / len(SPREAD)
-    q, v, a = smooth(t, log.q)
-    return Episode(log, t, step, torque, float(q[0]), float(v[0]), q, v, a, u)
+    nothing = np.zeros((0, 0))
+    return _on_grid(Episode(log, t, log.dt, np.zeros(0), nothing, *smooth(t, log.q), u), most)
+
+
+def _on_grid(e: Episode, most: float) -> Episode:
+    dt = float(np.median(np.diff(e.t)))
+    step = dt / max(1, int(np.ceil(dt / most - 1e-9)))
+    count = int(np.ceil(e.t[-1] / step - 1e-9)) + 1
+    middle = np.arange(count) * step
+    torque = sum(_input_at(e.t, e.u, middle + s * step) for s in SPREAD) / len(SPREAD)
+    return replace(e, step=step, torque=torque, edges=_edges(e.t, e.u, middle, step))
+
+
+def _edges(t: np.ndarray, u: np.ndarray, middle: np.ndarray, step: float) -> np.ndarray:
+    """See :class:`Episode`; on a grid of steps about the times ``middle``."""
+    gap, dt, out = np.diff(t), float(np.median(np.diff(t))), []
+    if held(u) and u.any():
+        for k in np.flatnonzero(np.diff(u) != 0):
+            # Evenly spaced rows are taken to be written by what holds the input: it changes at the row.
+            if np.abs(gap[max(k - 1, 0) : k + 2] - dt).max() > EVEN * dt:
+                inside = sum((middle + s * step >= t[k]) & (middle + s * step < t[k + 1]) for s in SPREAD) / len(SPREAD)
+                out.append((u[k + 1] - u[k]) * inside)
+    return np.array(out).reshape(len(out), len(middle))
 
 
 # A velocity step at time k h stands for the input from (k - 1/2) h to (k + 1/2) h: positions are then second-order
@@ -86,21 +112,18 @@ def _input_at(t: np.ndarray, u: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def windows(episode: Episode, count: int) -> list[Episode]:
-    """Cut an episode into pieces that are simulated each from its own state; (at most ``count``, 25 samples at least).
-
-    Over a short piece a wrong model is wrong by little, so fits have no false minima there.
-    """
+    """Cut an episode into at most ``count`` pieces of 25 samples or more."""
     n = len(episode.t)
     edges = np.linspace(0, n, max(1, min(count, n // 25)) + 1).astype(int)
     out = []
     for a, b in zip(edges[:-1], edges[1:], strict=True):
-        k = int(round(episode.t[a] / episode.step))
-        t = episode.t[a:b] - episode.t[a]
-        last = k + int(np.ceil(t[-1] / episode.step - 1e-9)) + 1
         old = episode.log
-        log = JointLog(old.name, old.time[a:b], old.q[a:b])
-        out.append(Episode(log, t, episode.step, episode.torque[k:last], float(episode.q[a]), float(episode.v[a]),
-                           episode.q[a:b], episode.v[a:b], episode.a[a:b], episode.u[a:b]))  # fmt: skip
+        extra = {k: getattr(old, k)[a:b] for k in ("torque", "force", "point", "markers")
+                 if getattr(old, k) is not None}  # fmt: skip
+        piece = replace(episode, log=JointLog(old.name, old.time[a:b], old.q[a:b], **extra),
+                        t=episode.t[a:b] - episode.t[a],
+                        **{k: getattr(episode, k)[a:b] for k in ("q", "v", "a", "u")})  # fmt: skip
+        out.append(_on_grid(piece, episode.step))
     return out
 
 
@@ -113,25 +136,14 @@ def smooth(t: np.ndarray, q: np.ndarray, half: int = 6) -> tuple[np.ndarray, np.
     x = t[index] - t[:, None]
     scale = np.abs(x).max(axis=1, keepdims=True)
     basis = (x / scale)[..., None] ** np.arange(4)
-    c = np.linalg.pinv(basis) @ q[index][..., None]
+    gram = np.swapaxes(basis, 1, 2) @ basis
+    c = np.linalg.solve(gram, np.swapaxes(basis, 1, 2) @ q[index][..., None])
     return c[:, 0, 0], c[:, 1, 0] / scale[:, 0], 2 * c[:, 2, 0] / scale[:, 0] ** 2
 
 
 @dataclass(frozen=True)
-class Job:
-    """One column: terms by name, the episode's number, the initial state; splines are (KNOTS,) torques at knots."""
-
-    terms: dict[str, float]
-    episode: int
-    q0: float
-    v0: float
-    spline_q: np.ndarray | None = None
-    spline_v: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
 class Frame:
-    """Where the spline knots lie: (low, high) in q and in velocity; and the middle of the motion."""
+    """Where the motion lies: (low, high) in q and in velocity."""
 
     q: tuple[float, float]
     v: tuple[float, float]
@@ -140,188 +152,88 @@ class Frame:
     def middle(self) -> float:
         return 0.5 * (self.q[0] + self.q[1])
 
-
-def extra_torque(terms: dict[str, np.ndarray], q: np.ndarray, v: np.ndarray, frame: Frame) -> np.ndarray | float:
-    """Added torque that is a smooth function of q and v (no dry friction, no damping), shapes broadcast."""
-    f: np.ndarray | float = 0.0
-    if "stiffness" in terms:
-        f = f - terms["stiffness"] * (q - frame.middle) + terms["spring_torque"]
-    if "torque" in terms:
-        f = f + terms["torque"]
-    if "gravity_sin" in terms:
-        f = f + terms["gravity_sin"] * np.sin(q) + terms["gravity_cos"] * np.cos(q)
-    if "detent_strength" in terms:
-        x = (q - terms["detent_place"]) / np.where(terms["detent_width"] > 0, terms["detent_width"], 1.0)
-        f = f - terms["detent_strength"] * x * np.exp(0.5 - 0.5 * np.minimum(x * x, 80.0))
-    if "stop_stiffness" in terms:
-        side = np.where(terms["stop_place"] >= frame.middle, 1.0, -1.0)
-        deep = side * (q - terms["stop_place"])
-        push = terms["stop_stiffness"] * deep + terms["stop_damping"] * side * v
-        f = f - side * np.where(deep > 0, np.maximum(push, 0.0), 0.0)
-    return f
+    @property
+    def row(self) -> np.ndarray:
+        return np.array([*self.q, *self.v, self.middle])
 
 
-def hats(x: np.ndarray, low: float, high: float, knots: np.ndarray) -> np.ndarray:
-    """Piecewise-linear value at x (B,) of the knots (B, KNOTS)."""
-    s = np.clip((x - low) / (high - low), 0, 1) * (KNOTS - 1)
-    i = np.minimum(s.astype(int), KNOTS - 2)
-    rows = np.arange(len(x))
-    return knots[rows, i] + (s - i) * (knots[rows, i + 1] - knots[rows, i])
-
-
-def rollouts(plant: Plant, episodes: Sequence[Episode], jobs: Sequence[Job], frame: Frame) -> list[np.ndarray]:
-    """What the sensor would read at the samples of each job's episode: a list of (N,).
-
-    A column whose state runs away is frozen where it is 1e3 of the motion's range off.
-    """
-    step = episodes[0].step
-    if any(abs(e.step - step) > 1e-9 for e in episodes):  # logs of several rates: each rate by itself
-        out: list = [None] * len(jobs)
-        for s in {e.step for e in episodes}:
-            mine = [i for i, j in enumerate(jobs) if episodes[j.episode].step == s]
-            same = [e for e in episodes if e.step == s]
-            number = {id(e): k for k, e in enumerate(same)}
-            moved = [Job(j.terms, number[id(episodes[j.episode])], j.q0, j.v0, j.spline_q, j.spline_v)
-                     for j in (jobs[i] for i in mine)]  # fmt: skip
-            for i, r in zip(mine, rollouts(plant, same, moved, frame) if moved else [], strict=True):
-                out[i] = r
-        return out
-    which = np.array([j.episode for j in jobs])
-    count = max(len(episodes[e].torque) for e in set(which))
-    inputs = np.zeros((count, len(episodes)))
-    for e, ep in enumerate(episodes):
-        inputs[: len(ep.torque), e] = ep.torque[:count]
-    names = sorted({n for j in jobs for n in j.terms})
-    terms = {n: np.array([j.terms.get(n, 0.0) for j in jobs]) for n in names}
-    inertia = plant.inertia + terms.get("inertia", 0.0)
-    b1, b2, b3 = plant.damping
-    b1 = b1 + terms.get("damping", 0.0)
-    b2 = b2 + terms.get("drag", 0.0)
-    quadratic = "drag" in terms or plant.damping[1] != 0
-    dry = plant.frictionloss + terms.get("coulomb", 0.0)
-    rubbing = "coulomb" in terms or "stiction" in terms or plant.frictionloss > 0
-    if "stiction" in terms:
-        slow = 1.0 / np.where(terms["stribeck_velocity"] > 0, terms["stribeck_velocity"], 1.0)
-    kq = _stack([j.spline_q for j in jobs])
-    kv = _stack([j.spline_v for j in jobs])
-    limit = frame.middle + np.array([-1e3, 1e3]) * (frame.q[1] - frame.q[0])
-
-    q = np.array([j.q0 for j in jobs])
-    v = np.array([j.v0 for j in jobs])
-    Q, V = np.empty((count + 1, len(jobs))), np.empty((count + 1, len(jobs)))
-    Q[0], V[0] = q, v
-    fast = 1e4 * max(abs(frame.v[0]), abs(frame.v[1]))
-    stop = _nominal_stop(plant)
-    plain = plant.static_table is None
-    a, b, c = plant.gravity
-    swings = plant.hinge and (a != 0 or b != 0)
-    for k in range(count):
-        f = inputs[k, which]
-        if plain:
-            if swings:
-                f += a * np.sin(q) + b * np.cos(q)
-            if c or plant.stiffness:
-                f += c - plant.stiffness * (q - plant.springref)
-        else:
-            f += plant.static(q)
-        f = f + extra_torque(terms, q, v, frame)
-        if kq is not None:
-            f = f + hats(q, *frame.q, kq)
-        if kv is not None:
-            f = f + hats(v, *frame.v, kv)
-        slope = b1
-        f = f - b1 * v
-        if quadratic:
-            speed = np.abs(v)
-            f = f - b2 * v * speed
-            slope = slope + 2 * b2 * speed
-        if b3:
-            f = f - b3 * v**3
-            slope = slope + 3 * b3 * v * v
-        if stop is not None:
-            f = f + stop(q, v, f, inertia)
-        # Damping acts at the middle of the step; at its end (as MuJoCo has it) it would weigh as inertia b h / 2.
-        gain = step / (inertia + 0.5 * step * slope)
-        v = v + gain * f
-        if rubbing:
-            level = dry
-            if "stiction" in terms:
-                level = dry + terms["stiction"] * np.exp(-np.minimum((v * slow) ** 2, 80.0))
-            v = np.sign(v) * np.maximum(np.abs(v) - gain * level, 0.0)
-        v = np.minimum(np.maximum(v, -fast), fast)
-        q = np.minimum(np.maximum(q + step * v, limit[0]), limit[1])
-        Q[k + 1], V[k + 1] = q, v
-    zero = np.zeros(len(jobs))
-    delay, bias, gain_error, bend, twist = (terms.get(n, zero) for n in ("delay", "bias", "gain", "bend", "twist"))
-    read: list = [None] * len(jobs)
-    for e in set(which):
-        mine = np.flatnonzero(which == e)
-        at = episodes[e].t / step
-        if not delay[mine].any() and np.abs(at - np.round(at)).max() < 1e-6:  # samples lie on the grid
-            values = Q[np.round(at).astype(int)][:, mine].T
-        else:
-            values = [_sample(Q[:, i], V[:, i], episodes[e].t - delay[i], step) for i in mine]
-        for i, y in zip(mine, values, strict=True):
-            read[i] = (1 + gain_error[i]) * y + bias[i]
-            if bend[i] or twist[i]:
-                x = y - frame.middle
-                read[i] = read[i] + bend[i] * x * x + twist[i] * x * x * x
-    return read
-
-
-def _stack(values: list) -> np.ndarray | None:
-    if all(v is None for v in values):
-        return None
-    return np.stack([np.zeros(KNOTS) if v is None else v for v in values])
-
-
-def _sample(q: np.ndarray, v: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
-    """Cubic between the grid's states; before the start the motion goes on backwards with its first acceleration."""
-    k = np.clip((t / step).astype(int), 0, len(q) - 2)
-    s = t / step - k
-    s = np.clip(s, 0, 1)
-    a, b = q[k], q[k + 1]
-    da, db = v[k] * step, v[k + 1] * step
-    out = a + s * (da + s * (3 * (b - a) - 2 * da - db + s * (da + db - 2 * (b - a))))
-    early = t < 0
-    if early.any():
-        first = (v[1] - v[0]) / step
-        out = np.where(early, q[0] + v[0] * t + 0.5 * first * t * t, out)
+def row_of(terms: dict[str, float]) -> np.ndarray:
+    """Terms by name as a row for the kernel."""
+    out = np.zeros(len(TERMS))
+    for name, value in terms.items():
+        out[kernel.INDEX[name]] = value
     return out
 
 
-def _nominal_stop(plant: Plant):
-    """Torque of the model's own joint limits, with MuJoCo's default softness; None if it has none."""
-    if plant.limits is None:
-        return None
-    low, high = plant.limits
-    d, b, k = 0.95, 2 / (0.95 * 0.02), 1 / (0.95 * 0.95 * 0.02 * 0.02)
+def readings(plant: Plant, frame: Frame, episode: Episode, rows: np.ndarray, local: np.ndarray,
+             splines: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
+    """What the sensor would show at the episode's samples, (B, N).
 
-    def torque(q: np.ndarray, v: np.ndarray, f: np.ndarray, inertia: np.ndarray | float) -> np.ndarray:
-        out = np.zeros_like(q)
-        for side, place in ((1.0, high), (-1.0, low)):
-            deep = side * (q - place)
-            push = d * (f * side + inertia * (b * v * side + k * deep))
-            out -= side * np.where(deep > 0, np.maximum(push, 0.0), 0.0)
-        return out
-
-    return torque
-
-
-def mujoco_rollout(model: mujoco.MjModel, episode: Episode, q0: float, v0: float) -> np.ndarray:
-    """Positions (N,) at the episode's samples of a model from :func:`diagnose.plant.isolated`, by ``mj_step``.
-
-    The input acts at the model's own time step; states are read before each step, at the time they belong to.
+    Args:
+        rows: (B, terms) in the order of :data:`TERMS`.  local: (B, 2 + M) as :attr:`Episode.start`.
+        splines: (B, 2 KNOTS) torques at knots over q, then over velocity; None for none.
     """
-    data = mujoco.MjData(model)
-    data.qpos[0], data.qvel[0] = q0, v0
+    rows, local = np.atleast_2d(rows), np.atleast_2d(local)
+    numbers, table = plant.row()
+    out = np.empty((len(rows), len(episode.t)))
+    which = np.zeros(len(rows), np.int64)
+    torques = episode.torque[None]
+    if len(episode.edges):
+        shifts, which = np.unique(local[:, 2:], axis=0, return_inverse=True)
+        torques = episode.torque + shifts @ episode.edges
+        which = which.reshape(-1)
+    if splines is None:
+        splines = np.zeros((len(rows), 0))
+    kernel.columns(rows, numbers, table, frame.row, splines, torques, which, episode.step,
+                   np.ascontiguousarray(local[:, 0]), np.ascontiguousarray(local[:, 1]), episode.t, out)  # fmt: skip
+    return out
+
+
+def needed(plant: Plant, frame: Frame, episode: Episode, terms: np.ndarray, spline: np.ndarray | None = None
+           ) -> np.ndarray:  # fmt: skip
+    """The input torque that the episode's smoothed motion takes, (N,)."""
+    numbers, table = plant.row()
+    out = np.empty(len(episode.t))
+    q = (episode.q - terms[kernel.BIAS]) / (1 + terms[kernel.GAIN])
+    kernel.needed(terms, numbers, table, frame.row, np.zeros(0) if spline is None else spline, q, episode.v,
+                  episode.a, out)  # fmt: skip
+    return out
+
+
+def mujoco_rollouts(model: mujoco.MjModel, episode: Episode, starts: Sequence[np.ndarray]
+                    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """States of a model from :func:`diagnose.plant.isolated` by ``mj_step``, from each start as :attr:`Episode.start`.
+
+    The input acts at the model's own time step. States are those before each step, at the time they belong to.
+
+    Returns:
+        positions and velocities on the model's own grid, (S, K + 1) each.
+    """
+    from mujoco import rollout
+
     h = model.opt.timestep
     count = int(np.ceil(episode.t[-1] / h)) + 1
-    inputs = sum(_input_at(episode.t, episode.u, (np.arange(count) + s) * h) for s in SPREAD) / len(SPREAD)
-    q, v = np.empty(count + 1), np.empty(count + 1)
-    for k in range(count):
-        q[k], v[k] = data.qpos[0], data.qvel[0]
-        data.qfrc_applied[0] = inputs[k]
-        mujoco.mj_step(model, data)
-    q[count], v[count] = data.qpos[0], data.qvel[0]
-    return _sample(q, v, episode.t, h)
+    grid = np.arange(count) * h
+    inputs = sum(_input_at(episode.t, episode.u, grid + s * h) for s in SPREAD) / len(SPREAD)
+    edges = _edges(episode.t, episode.u, grid, h)
+    driven = np.array([inputs + x[2:] @ edges for x in starts])
+    data = mujoco.MjData(model)
+    first = []
+    for start in starts:
+        mujoco.mj_resetData(model, data)
+        data.qpos[0], data.qvel[0] = start[:2]
+        state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        first.append(state)
+    states, _ = rollout.rollout(model, data, np.array(first), driven[..., None],
+                                control_spec=int(mujoco.mjtState.mjSTATE_QFRC_APPLIED))  # fmt: skip
+    path = np.concatenate([np.array(first)[:, None], states], axis=1)
+    return path[:, :, 1], path[:, :, 1 + model.nq]
+
+
+def shown(plant: Plant, frame: Frame, terms: dict[str, float], q: np.ndarray, v: np.ndarray, t: np.ndarray, step: float
+          ) -> np.ndarray:  # fmt: skip
+    """What the sensor shows at times t (N,) of states q, v (K + 1,) on a grid."""
+    out = np.empty(len(t))
+    kernel.read(row_of(terms), frame.row, q, v, t, step, out)
+    return out

@@ -1,6 +1,7 @@
 """The library of causes, one file each; :data:`CAUSES` maps the contract's names to them."""
 
 from diagnose.causes import (
+    backlash,
     constant_torque,
     coulomb_friction,
     detent,
@@ -21,7 +22,7 @@ from diagnose.causes.base import Cause, Motion, Parameter, frame_of
 CAUSES: dict[str, Cause] = {
     m.CAUSE.name: m.CAUSE
     for m in (viscous_damping, quadratic_drag, coulomb_friction, stribeck_friction, spring, constant_torque,
-              gravity_torque, inertia, end_stop, detent, time_delay, sensor_bias, sensor_gain,
+              gravity_torque, inertia, backlash, end_stop, detent, time_delay, sensor_bias, sensor_gain,
               sensor_distortion)
 }  # fmt: skip
 

@@ -86,7 +86,8 @@ class Cause:
 
     Attributes:
         name: of the contract.  sentence: the physics.  parameters: what is fitted.
-        features: (motion, shape) -> {term: (N,) torque per unit of the term}, for the linear first guess.
+        features: (motion, shape) -> {term: (N,) torque against the motion per unit of the term}, for the first guess.
+        reading: the same for what a term of the measurement adds to the position read, (N,) rad or m.
         shapes: motion -> starts for the terms that are not linear, one dict a start.
         decisive: terms of which one must differ from 0.
         edit: (spec, joint, terms, plant, frame) puts it into the model; None for faults of the measurement.
@@ -101,6 +102,7 @@ class Cause:
     parameters: tuple[Parameter, ...]
     decisive: tuple[str, ...]
     features: Callable[[Motion, Terms], dict[str, np.ndarray]] = lambda motion, shape: {}
+    reading: Callable[[Motion, Terms], dict[str, np.ndarray]] = lambda motion, shape: {}
     shapes: Callable[[Motion], list[Terms]] = field(default=lambda motion: [{}])
     edit: Callable[[mujoco.MjSpec, str, Terms, Plant, Frame], None] | None = None
     measurement: bool = False

@@ -14,8 +14,8 @@ def waves(terms, frame):
     """Sines and cosines that add up to the catch within the motion's range: (rates, sine, cosine), each (K,)."""
     span = frame.q[1] - frame.q[0]
     grid = np.linspace(frame.q[0] - 0.2 * span, frame.q[1] + 0.2 * span, 2001)
-    period = 1.8 * span
-    count = int(np.clip(np.ceil(4.0 * period / (2 * np.pi * terms["detent_width"])), 4, 60))
+    period = 1.5 * span
+    count = int(np.clip(np.ceil(4.0 * period / (2 * np.pi * terms["detent_width"])), 4, 150))
     rates = 2 * np.pi * np.arange(1, count + 1) / period
     basis = np.concatenate([np.sin(grid[:, None] * rates), np.cos(grid[:, None] * rates)], axis=1)
     c = np.linalg.lstsq(basis, torque(terms, grid), rcond=1e-6)[0]
@@ -38,6 +38,6 @@ CAUSE = Cause(
     ("detent_strength",), edit=edit,
     features=lambda m, s: {"detent_strength": -torque({**s, "detent_strength": 1.0}, m.q)},
     shapes=lambda m: [{"detent_place": m.frame.q[0] + p * m.span, "detent_width": w * m.span}
-                      for p in np.linspace(0, 1, 17) for w in (0.04, 0.12)],
+                      for w in (0.02, 0.05, 0.12) for p in np.linspace(0, 1, 34)],
     experiment="move slowly through the place in both directions and log the torque",
 )  # fmt: skip

@@ -41,6 +41,6 @@ CAUSE = Cause(
                lambda m: m.torque / m.speed)),
     ("stop_stiffness",), features=features, edit=edit,
     shapes=lambda m: [{"stop_place": m.frame.q[0] + s * m.span}
-                      for s in (*np.linspace(0.02, 0.4, 12), *np.linspace(0.6, 0.98, 12))],
+                      for s in (*np.linspace(0.01, 0.4, 27), *np.linspace(0.6, 0.99, 27))],
     experiment="run into the suspected stop at several speeds, and lean on it with several steady torques",
 )  # fmt: skip

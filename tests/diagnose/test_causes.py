@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from diagnose.causes import CAUSES, UNNAMED
+from diagnose.kernel import TERMS as KERNEL_TERMS
 from diagnose.log import JointLog
 from diagnose.plant import isolated, load_plant
-from diagnose.simulate import Frame, Job, mujoco_rollout, prepare, rollouts
+from diagnose.simulate import Frame, mujoco_rollouts, prepare, readings, row_of, shown
 
 XML = """<mujoco><compiler angle="{angle}"/><option timestep="0.001" integrator="implicitfast"/><worldbody>
 <body pos="0 0 1"><joint name="j" type="hinge" axis="0 1 0.5" stiffness=".1" springref="{ref}" damping=".01"/>
@@ -45,9 +46,10 @@ def test_edit_agrees_with_the_fit(tmp_path, name, terms, tolerance, angle, ref):
     model = isolated(again, "j")
     assert model.nu == 0
     ep = episode(plant)
-    real = mujoco_rollout(model, ep, 0.1, 0.0)
-    ours = rollouts(plant, [ep], [Job(terms, 0, 0.1, 0.0)], FRAME)[0]
-    nominal = rollouts(plant, [ep], [Job({}, 0, 0.1, 0.0)], FRAME)[0]
+    start = np.array([0.1, 0.0])
+    Q, V = mujoco_rollouts(model, ep, [start])
+    real = shown(plant, FRAME, {}, Q[0], V[0], ep.t, model.opt.timestep)
+    ours, nominal = readings(plant, FRAME, ep, np.stack([row_of(terms), row_of({})]), np.tile(start, (2, 1)))
     effect = np.abs(ours - nominal).max()
     assert effect > 0.02
     assert np.abs(real - ours).max() < max(tolerance, 2e-3)
@@ -55,11 +57,11 @@ def test_edit_agrees_with_the_fit(tmp_path, name, terms, tolerance, angle, ref):
 
 def test_names_are_those_of_the_contract():
     contract = {"viscous_damping", "quadratic_drag", "coulomb_friction", "stribeck_friction", "spring",
-                "constant_torque", "gravity_torque", "inertia", "end_stop", "detent", "time_delay", "sensor_bias",
-                "sensor_gain"}  # fmt: skip
+                "constant_torque", "gravity_torque", "inertia", "backlash", "end_stop", "detent", "time_delay",
+                "sensor_bias", "sensor_gain"}  # fmt: skip
     assert set(CAUSES) - set(UNNAMED) == contract
     terms = [p.term for c in CAUSES.values() for p in c.parameters]
-    assert set(terms) <= set(__import__("diagnose.simulate", fromlist=["TERMS"]).TERMS)
+    assert set(terms) <= set(KERNEL_TERMS)
 
 
 def test_hand_force_is_a_torque_about_the_axis(tmp_path):
@@ -81,6 +83,36 @@ def test_step_input_is_aligned_to_a_fraction_of_a_step(tmp_path):
     t = np.arange(0, 1, 0.01)
     log = JointLog("s", t, np.sin(t), np.where(t >= 0.3 - 1e-9, 0.01, 0.0))
     ep = prepare(plant, log)
-    got = rollouts(plant, [ep], [Job({}, 0, 0.0, 0.0)], FRAME)[0]
+    got = readings(plant, FRAME, ep, row_of({}), np.zeros(2))[0]
     exact = 0.5 * 0.01 / plant.inertia * np.maximum(t - 0.3, 0) ** 2
     assert np.abs(got - exact).max() < 1e-3 * exact.max()
+
+
+def test_weight_swings_in_its_own_time_with_long_steps(tmp_path):
+    """Fourth order for smooth torques: 5 ms steps keep the phase of a pendulum to the noise of a good encoder."""
+    path = tmp_path / "m.xml"
+    path.write_text(XML.format(angle="radian", ref=0.0).replace('stiffness=".1"', "").replace('damping=".01"', ""))
+    plant = load_plant(path, "j")
+    t = np.arange(0, 6, 0.01)
+    log = JointLog("s", t, np.sin(t))
+    start = np.array([1.0, 0.0])
+    shapes = []
+    for most in (5e-3, 2e-4):
+        ep = prepare(plant, log, most)
+        first = start.copy()
+        first[1] = -0.5 * ep.step * plant.static(np.array([1.0]))[0] / plant.inertia  # half a step before
+        shapes.append(readings(plant, FRAME, ep, row_of({}), first)[0])
+    assert np.abs(shapes[0] - shapes[1]).max() < 2e-4
+
+
+def test_reading_with_play_stands_still_at_a_reversal(tmp_path):
+    path = tmp_path / "m.xml"
+    path.write_text(XML.format(angle="radian", ref=0.0))
+    plant = load_plant(path, "j")
+    t = np.arange(0, 3, 0.01)
+    ep = prepare(plant, JointLog("s", t, np.sin(t)))
+    rows = np.stack([row_of({}), row_of({"play": 0.1})])
+    true, read = readings(plant, FRAME, ep, rows, np.tile([0.8, 0.0], (2, 1)))
+    assert np.abs(read - true).max() == pytest.approx(0.05, abs=1e-6)
+    moving = np.abs(np.diff(true)) > 2e-3
+    assert (np.diff(read)[moving] == 0).any() and np.ptp(read) < np.ptp(true)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diagnose import JointLog, LogError, diagnose, load_log
-from diagnose.log import check_units
+from diagnose.log import check_units, drop_stale
 from taa_envs.errors import TaaEnvsError
 
 GOOD = "time,q,torque,note\n" + "".join(f"{i * 0.01:.2f},{0.01 * i:.4f},0,x\n" for i in range(40))
@@ -56,3 +56,16 @@ def test_unknown_model_and_joint(tmp_path):
     model.write_text("<mujoco><worldbody><body><joint name='lid'/><geom size='.1'/></body></worldbody></mujoco>")
     with pytest.raises(TaaEnvsError, match="it has: lid"):
         diagnose(model, [log], "door")
+
+
+def test_stale_rows_are_left_out_and_rounded_ones_are_not():
+    t = np.arange(300) * 0.01
+    rng = np.random.default_rng(0)
+    q = np.sin(2 * t) + 1e-3 * rng.standard_normal(300)
+    stale = q.copy()
+    for k in range(5, 300, 9):
+        stale[k] = stale[k - 1]
+    kept, count = drop_stale(JointLog("x", t, stale))
+    assert count >= 30 and len(kept.q) == 300 - count
+    assert drop_stale(JointLog("x", t, q))[1] == 0
+    assert drop_stale(JointLog("x", t, np.round(q, 2)))[1] == 0
