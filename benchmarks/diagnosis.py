@@ -32,8 +32,8 @@ sys.modules["injector"] = injector
 _SPEC.loader.exec_module(injector)
 
 SEED = 20_000  # of the table; development used others
-STRENGTHS = (0.01, 0.03, 0.1, 0.3)
-CURVES = ("viscous_damping", "coulomb_friction", "spring", "detent")
+STRENGTHS = (0.02, 0.06, 0.2)
+CURVES = ("viscous_damping", "coulomb_friction", "detent")
 
 
 def cells() -> Iterator[tuple[str, tuple[str, ...], dict]]:

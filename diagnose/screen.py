@@ -23,7 +23,7 @@ from diagnose.simulate import Episode
 
 WINDOW = 1.5  # s
 BEAM = 24  # sets of one size that are extended
-SHAPES = 3  # starts of one set (places, widths)
+SHAPES = 2  # starts of one set (places, widths)
 
 
 @dataclass(frozen=True)

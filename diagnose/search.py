@@ -23,6 +23,7 @@ FIT_MARGIN = 8.0  # nats of the Bayesian criterion on the fitted episodes
 HELD_MARGIN = 3.0  # nats of log-likelihood on the held-out episodes
 HELD_GAIN = 0.98  # of the held-out error without the cause
 RIVAL = 4.0  # nats within which two sets explain equally well
+FAR = 8.0  # times what the best regression leaves: sets beyond are not fitted
 TOP = 5  # sets of one size that are fitted
 ROUNDS = 4  # of looking around the best set
 SHARP = ("stribeck_friction", "end_stop", "detent")  # want short steps
@@ -149,7 +150,9 @@ class Search:
         size = next(k for k in sorted(leaves) if leaves[k] <= 1.2 * leaves[most])
         self._fit([Guess((), {}, 0.0)])
         for k in range(max(size - 1, 1), min(size + 1, most) + 1):
-            self._fit(regression.refine(g) for g in lists.get(k, []))
+            guesses = [regression.refine(g) for g in lists.get(k, [])]
+            # Far behind in the regression is far behind in the fit; near the noise all are near.
+            self._fit(g for g in guesses if g.rss <= FAR * leaves[most])
 
     def _listen(self, best: Fit) -> None:
         """Take the noise that the best set leaves, and fit again under it what may still compete."""
