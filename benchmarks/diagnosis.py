@@ -178,7 +178,8 @@ def tables(rows: list[dict]) -> str:
         out.append("Held-out error of explained cases (the oracle is told the true causes).\n\n" + lines_of(
             ["", "cases", "median", "95th centile", "within 1.15"], body))  # fmt: skip
     cpu = np.array([r["cpu"] for r in rows])
-    out.append(f"Processor time a diagnosis: median {np.median(cpu):.1f} s, largest {cpu.max():.1f} s ({len(cpu)} cases).")
+    out.append(f"Processor time a diagnosis: median {np.median(cpu):.1f} s, largest {cpu.max():.1f} s "
+               f"({len(cpu)} cases).")  # fmt: skip
     return "\n\n".join(out)
 
 

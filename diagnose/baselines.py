@@ -6,6 +6,7 @@ initial states fitted, as the diagnosis is.
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -60,8 +61,8 @@ def _residuals(problem: Problem, model: mujoco.MjModel, starts: np.ndarray) -> l
 
 def all_parameters(fitted: Problem, held: Problem) -> float:
     """Everything that the joint's MJCF holds as a number, fitted together by ``mujoco.sysid``."""
-    from mujoco import sysid
-
+    # A plain import makes mypy read the package, which then hides the names that MuJoCo's compiled module adds.
+    sysid = importlib.import_module("mujoco.sysid")
     m, p = fitted.motion, fitted.plant
     unit = np.array([m.torque / m.speed, m.torque / m.speed**2, m.torque, m.torque / m.span, m.torque, p.inertia])
     starts = np.array([e.start[:2] for e in fitted.episodes])

@@ -12,6 +12,7 @@ import numpy as np
 
 from diagnose.causes import CAUSES, Motion
 from diagnose.fit import Fit, Problem, linearise
+from diagnose.kernel import KNOTS
 from diagnose.log import JointLog, LogError, check_units, drop_stale, load_log
 from diagnose.noise import Noise
 from diagnose.plant import Plant, isolated, load_plant
@@ -34,6 +35,7 @@ class Diagnosis:
         data: the JSON object of the contract (without ``extended_model`` until :meth:`write`).
         plant, found: the joint and the search behind it.
         fitted, held: the two groups of episodes.
+        partly: False if the extended model is the nominal one although something was found.
         curves: name of episode -> {"time", "q", "nominal", "extended"} for plots.
     """
 
@@ -44,6 +46,7 @@ class Diagnosis:
     fitted: Problem
     held: Problem
     curves: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    partly: bool = True
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -51,9 +54,8 @@ class Diagnosis:
         return tuple(c["name"] for c in self.data["causes"])
 
     def extended_spec(self) -> mujoco.MjSpec:
-        """The nominal model with what was found (the nominal model itself where nothing may be named)."""
-        return extended(self.plant, self.found.best if self.verdict in ("explained", "ambiguous") else
-                        self.found.nominal, self.fitted)  # fmt: skip
+        """The nominal model with what was found (of an unexplained residual, with what explains part of it)."""
+        return extended(self.plant, self.found.best if self.partly else self.found.nominal, self.fitted)
 
     def write(self, folder: Path | str, final: Path | None = None) -> Path:
         """Write diagnosis.json, report.html and model_extended.xml; returns the folder.
@@ -83,7 +85,8 @@ class Diagnosis:
 
 
 def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = "joint",
-             say: Callable[[str], None] = lambda line: None, only: Sequence[str] | None = None) -> Diagnosis:  # fmt: skip
+             say: Callable[[str], None] = lambda line: None,
+             only: Sequence[str] | None = None) -> Diagnosis:  # fmt: skip
     """Say what the model gets wrong about a joint, from measured logs.
 
     Args:
@@ -224,23 +227,32 @@ def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: 
         verdict = "ambiguous"
     else:
         verdict = "explained"
+    unit = plant.torque_unit if fitted.driven else plant.unit
+    partly = True
     nominal = _errors(plant, found.nominal, held, fitted)
     named = best.causes if verdict in ("explained", "ambiguous") else ()
     after = _errors(plant, best, held, fitted) if named else nominal
     if verdict == "unexplained":
-        tried = [s.held.residuals for s in (best, found.free) if s is not None]
-        after = min([nominal, *tried], key=_rms)
-        if found.free is not None and after is found.free.held.residuals:
-            assumptions.append("the extended error is that of free torques over position and velocity beside "
-                               f"{', '.join(best.causes) or 'no cause'}; the model does not hold them")  # fmt: skip
+        part = _errors(plant, best, held, fitted) if best.causes else nominal
+        after = min(nominal, part, key=_rms)
+        partly = after is part and bool(best.causes)
+        if partly:
+            assumptions.append(f"the extended model holds {', '.join(best.causes)}, which explains part of the error; "
+                               "what is left biases their values beyond their intervals")  # fmt: skip
+        if found.free is not None:
+            left = _rms(found.free.held.residuals)
+            assumptions.append(f"free torques over position and velocity ({KNOTS} knots each) beside "
+                               f"{', '.join(best.causes) or 'no cause'} leave {left:.4g} {unit} of the held-out "
+                               "episodes; plain MJCF has no such torque, so the model does not hold them")  # fmt: skip
     ratio, interval = _gain(nominal, after)
     causes = [_cause(n, best.fit, found, plant, fitted.motion.frame.middle) for n in named]
-    unit = plant.torque_unit if fitted.driven else plant.unit
     experiment = None
     if verdict == "unexplained":
         causes = [{"name": "unknown", "parameters": {}, "evidence": {
             "where": where(plant, held.episodes, best.held.residuals, unit), "why": found.left,
-            "partly": list(best.causes), "rmse": best.held.rmse}}]  # fmt: skip
+            "partly": list(best.causes), "rmse": best.held.rmse, "parameters": {
+                n: _cause(n, best.fit, found, plant, fitted.motion.frame.middle)["parameters"] for n in best.causes},
+            "free_torques": _free_torques(found, fitted)}}]  # fmt: skip
         experiment = "repeat the same motion twice, then at another speed and from the other side"
     alternatives = []
     if verdict == "ambiguous":
@@ -263,7 +275,7 @@ def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: 
                     for f in found.ranking[:12]],
         "noise": {"std": found.noise.std, "phi": found.noise.phi, "theta": found.noise.theta},
     }  # fmt: skip
-    result = Diagnosis(verdict, data, plant, found, fitted, held)
+    result = Diagnosis(verdict, data, plant, found, fitted, held, partly=partly)
     for i, e, n, x in zip(held_at, held.episodes, nominal, after, strict=True):
         y = e.u if held.driven else e.log.q
         result.curves[names[i]] = {"time": e.t, "q": e.q, "v": e.v, "measured": y, "nominal": y - n, "extended": y - x}
@@ -293,6 +305,16 @@ def _cause(name: str, fit: Fit, found: Found, plant: Plant, middle: float) -> di
                 "nats_heldout": 0.5 * (without.held.chi2 - found.best.held.chi2),
                 "heldout_rmse_without": without.held.rmse}  # fmt: skip
     return {"name": name, "parameters": parameters, "evidence": evidence}
+
+
+def _free_torques(found: Found, fitted: Problem) -> dict | None:
+    """The free torques beside the best set: knots over position and over velocity, and the torque at each."""
+    if found.free is None or found.free.fit.candidate.spline is None:
+        return None
+    frame, values = fitted.motion.frame, found.free.fit.candidate.spline
+    return {"position": np.linspace(*frame.q, KNOTS).tolist(), "torque_over_position": values[:KNOTS].tolist(),
+            "velocity": np.linspace(*frame.v, KNOTS).tolist(), "torque_over_velocity": values[KNOTS:].tolist(),
+            "unit": fitted.plant.torque_unit, "heldout_rmse": found.free.held.rmse}  # fmt: skip
 
 
 def _rms(residuals: list[np.ndarray]) -> float:

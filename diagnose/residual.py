@@ -40,9 +40,9 @@ def trim_start(plant: Plant, episode: Episode) -> int:
     """How many first samples of a log that claims to be let go cannot be free motion.
 
     Only where no input is logged at the start and the part moves already there. The acceleration that position and
-    velocity explain is learned from the rest of the log. The leading samples that leave it by more than 6 robust
-    standard deviations (until 8 samples in a row do not, at most 15 % of the log) are still held by something that
-    the log does not know.
+    velocity explain is learned from the rest of the log. While its average over a tenth of a second leaves that by
+    more than 6 robust standard deviations from the start on (at most 15 % of the log), the part is still held by
+    something that the log does not know.
     """
     e = episode
     n = len(e.t)
@@ -54,9 +54,12 @@ def trim_start(plant: Plant, episode: Episode) -> int:
     F = F / np.abs(F).max(axis=0).clip(1e-12)
     c = np.linalg.lstsq(F[most:], e.a[most:], rcond=1e-9)[0]
     r = e.a - F @ c
-    spread = 1.4826 * np.median(np.abs(r[most:] - np.median(r[most:]))) + 1e-300
-    off = np.abs(r[:most]) > 6 * spread
-    if off[:5].mean() < 0.5:
+    # Averages over a tenth of a second: what a hand or a stop does lasts, what a sensor does to accelerations does not.
+    long = max(8, int(round(0.1 / float(np.median(np.diff(e.t))))))
+    mean = np.convolve(r, np.ones(long) / long, mode="valid")
+    rest = mean[most:]
+    spread = 1.4826 * np.median(np.abs(rest - np.median(rest))) + 1e-300
+    off = np.abs(mean[: most + 1]) > 6 * spread
+    if not off[0]:
         return 0
-    calm = np.convolve(off, np.ones(8), mode="valid") == 0
-    return int(np.argmax(calm)) if calm.any() else most
+    return min(int(np.argmin(off)) + long // 2, most) if not off.all() else most

@@ -22,6 +22,7 @@ MOST = 4  # causes in a set
 FIT_MARGIN = 8.0  # nats of the Bayesian criterion on the fitted episodes
 HELD_MARGIN = 3.0  # nats of log-likelihood on the held-out episodes
 HELD_GAIN = 0.98  # of the held-out error without the cause
+SURE = 4.0  # standard deviations of a cause's decisive parameters from nothing
 RIVAL = 4.0  # nats within which two sets explain equally well
 FAR = 8.0  # times what the best regression leaves: sets beyond are not fitted
 TOP = 5  # sets of one size that are fitted
@@ -215,7 +216,7 @@ class Search:
             losses = []
             for name in best.causes:
                 without = self._judge(_less(best.causes, name))
-                helps = (without.fit.nats - full.fit.nats >= FIT_MARGIN
+                helps = (full.fit.z(name) >= SURE and without.fit.nats - full.fit.nats >= FIT_MARGIN
                          and 0.5 * (without.held.chi2 - full.held.chi2) >= HELD_MARGIN
                          and full.held.rmse <= HELD_GAIN * without.held.rmse)  # fmt: skip
                 losses.append((helps, without.score, without))

@@ -118,7 +118,19 @@ def test_free_swing_is_cut_and_its_rod_is_not_what_swings():
     folder = MEASURED / "freeswing"
     result = diagnose(folder / "model.xml", [folder / f"run{i}.csv" for i in (1, 2, 3)], "hinge")
     d = result.data
-    assert result.verdict != "consistent"
-    assert d["extended"]["heldout_rmse"] < 0.3 * d["nominal"]["heldout_rmse"]
+    assert result.verdict != "consistent" and "gravity_torque" in result.found.best.causes
+    assert d["extended"]["heldout_rmse"] < 0.1 * d["nominal"]["heldout_rmse"]
     assert any("ratios to the inertia" in a for a in d["assumptions"])
     assert sum("left out" in a for a in d["assumptions"]) == 3
+
+
+@pytest.mark.skipif(not MEASURED.is_dir(), reason="the measured data are not beside the repository")
+def test_cabinet_has_its_catch_where_the_pull_has_its_hump():
+    folder = MEASURED / "ikea_cabinet"
+    result = diagnose(folder / "model.xml", [folder / "run1.csv"], "hinge")
+    d = result.data
+    assert "detent" in result.found.best.causes
+    terms = result.found.best.fit.terms()
+    assert 0.1 < terms["detent_place"] + terms["detent_width"] < 0.25  # the pull peaks at 0.2 rad, over the rest
+    assert d["extended"]["heldout_rmse"] < 0.1 * d["nominal"]["heldout_rmse"]
+    assert any("imposed" in a for a in d["assumptions"])
