@@ -31,18 +31,18 @@ RSS_MB = 3072
 
 # target -> inputs of a full run; native decoders and MuJoCo's compiler take milliseconds an input
 RUNS = {
-    "metadata": 100_000,
-    "model_xml": 100_000,
-    "arrays": 50_000,
-    "reference": 50_000,
-    "cues": 50_000,
-    "scene": 10_000,
-    "stage": 10_000,
-    "log": 50_000,
-    "config": 50_000,
-    "mesh": 10_000,
-    "asset": 3_000,
-    "video": 2_000,
+    "metadata": 20_000,
+    "model_xml": 20_000,
+    "arrays": 15_000,
+    "reference": 15_000,
+    "cues": 15_000,
+    "log": 10_000,
+    "config": 10_000,
+    "scene": 3_000,
+    "stage": 3_000,
+    "mesh": 2_000,
+    "asset": 1_000,
+    "video": 700,
 }
 INSTRUMENTED = [
     "taa_envs.arrays",
