@@ -134,7 +134,8 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
 
     ## Info
     ``joint_progress``, ``final_q_error``, ``is_success`` (was one at some time of the episode), ``success_now``,
-    ``contact``, ``contact_fraction``, ``diverged``, ``reward_terms``; after a reset ``randomized``.
+    ``contact``, ``contact_fraction``, ``diverged``, ``warnings`` (how often MuJoCo warned in the last step),
+    ``reward_terms``; after a reset ``randomized``.
 
     ## Arguments
     asset: an id, a folder or an :class:`Asset`.  hand: name of a hand.  action, observation, reward: see above.

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _MEAN = np.full(21, 1 / 21)
 
 # Model fields that an episode may change, see taa_envs.randomize.
+BAD = slice(3, 6)
+"""Of the kinds of MuJoCo's warnings (mjtWarning), those of a state that is not finite: it then begins anew."""
 MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping", "dof_frictionloss")
 
 
@@ -43,6 +45,10 @@ class Rows(Protocol):
     @property
     def time(self) -> np.ndarray:
         """(n,) s of simulation."""
+
+    @property
+    def warnings(self) -> np.ndarray:
+        """(n, kinds) how often MuJoCo warned since it began anew; a copy."""
 
     def fields(self, row: int) -> Mapping[str, np.ndarray]:
         """Model fields of one simulation, to write into; call :meth:`constants` afterwards."""
@@ -96,6 +102,10 @@ class SingleRows:
     def time(self) -> np.ndarray:
         return np.array([self.data.time])
 
+    @property
+    def warnings(self) -> np.ndarray:
+        return np.array([self.data.warning.number])
+
     def fields(self, row: int) -> dict[str, np.ndarray]:
         return {name: getattr(self.model, name) for name in MODEL_FIELDS}
 
@@ -138,12 +148,16 @@ class BatchRows:
         self.link_pos = self.batch.bind("xpos")[:, body]
         self.link_mat = self.batch.bind("xmat")[:, body].reshape(n, 3, 3)
         self.touches = _touches(scene, self.batch.bind("history"))
-        self._time = self.batch.bind("time")
+        self._time, self._warning = self.batch.bind("time"), self.batch.warning
         self._model: dict[str, np.ndarray] = {}
 
     @property
     def time(self) -> np.ndarray:
         return self._time.copy()
+
+    @property
+    def warnings(self) -> np.ndarray:
+        return self._warning[..., 1].copy()
 
     def fields(self, row: int) -> dict[str, np.ndarray]:
         if not self._model:  # only where models differ: expanded fields are copied at every step

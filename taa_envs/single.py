@@ -15,7 +15,7 @@ import numpy as np
 from taa_envs.motion import CORRECTIONS, PACE, SLEW, TIPS
 from taa_envs.registry import CONTROL_PERIOD
 from taa_envs.reward import DRIVEN_SHARE, SUCCESS_PROGRESS, goal_reward, scalar_terms
-from taa_envs.rows import SingleRows
+from taa_envs.rows import BAD, SingleRows
 from taa_envs.scene import SUBSTEPS, TIMESTEP, Scene
 from taa_envs.task import Task
 
@@ -74,8 +74,13 @@ class SingleTask(Task):
         contact, torque = self._touch_one()
         driven = moved if moved > 0 and torque * self._stroke > 0 else 0.0
         self._mark_one(before, time, contact)
+        numbers = data.warning.number
+        raised = int(numbers.sum())
+        warned = max(raised - self._raised, 0)
+        self._raised, self._warned[0] = raised, warned
         clock = data.time
-        diverged = self._diverged.item() or clock < self._clock.item() + (SUBSTEPS - 0.5) * TIMESTEP
+        late = clock < self._clock.item() + (SUBSTEPS - 0.5) * TIMESTEP
+        diverged = late or self._diverged.item() or bool(warned and numbers[BAD].any())
         self._diverged[0], self._clock[0] = diverged, clock
         fraction = (q - self._start_q) / self._stroke
         first, total = self._first.item(), self._driven.item() + driven
@@ -94,7 +99,8 @@ class SingleTask(Task):
         self._action[0] = values
         info = {"joint_progress": min(max(fraction, 0.0), 1.0),
                 "final_q_error": abs(q - self._end_q) / self._range_q, "is_success": succeeded, "success_now": success,
-                "contact": contact, "contact_fraction": self._played[1] / max(self._played[0], 1), "diverged": diverged}
+                "contact": contact, "contact_fraction": self._played[1] / max(self._played[0], 1), "diverged": diverged,
+                "warnings": warned}
         if self.goal:
             return goal_reward(self.achieved(), np.array([[1.0, DRIVEN_SHARE]]))[0].item(), terms, info
         return float(sum(terms.values())), terms, info

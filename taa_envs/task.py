@@ -25,7 +25,7 @@ from taa_envs.motion import (
 )
 from taa_envs.registry import CONTROL_PERIOD
 from taa_envs.reward import DRIVEN_SHARE, GOAL, SUCCESS_PROGRESS, RewardInputs, goal_reward, reward_scales, reward_terms
-from taa_envs.rows import MODEL_FIELDS, Rows, hand_rows
+from taa_envs.rows import BAD, MODEL_FIELDS, Rows, hand_rows
 from taa_envs.scene import SUBSTEPS, TIMESTEP, Scene, touch_columns
 
 ABSOLUTES = 63
@@ -85,6 +85,7 @@ class Task:
         self._offset, self._time, self._clock = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
         self._first, self._driven = np.zeros(n), np.zeros(n)
         self._succeeded, self._diverged = np.zeros(n, bool), np.zeros(n, bool)
+        self._warned, self._raised = np.zeros(n, int), 0  # MuJoCo's warnings: in the last step, and since the start
         self._action = np.zeros((n, self.action_size), np.float32)
         self._correction = np.zeros((n, CORRECTIONS))
         self._aim = np.zeros((n, self._motion.count, 3))
@@ -155,7 +156,7 @@ class Task:
         self._apply(row, made)
         ids = np.array([row])
         self._offset[row] = 0.0 if made.hand is None else made.hand
-        self._time[row], self._clock[row] = time, 0.0
+        self._time[row], self._clock[row], self._warned[row], self._raised = time, 0.0, 0, 0
         self._first[row] = np.clip(float(self.asset.stroke_fraction(q0)), 0.0, 1.0)
         for values in (self._driven, self._succeeded, self._diverged, self._seen, self._hit, self._push,
                        self._action, self._correction):
@@ -180,18 +181,21 @@ class Task:
         n, rows, column = self.n, self.rows, self.scene.qpos
         if ids is not None:  # results of others are not to change their episodes
             kept = {name: getattr(self, name).copy() for name in self._STEP}
-        before, q = self._time, rows.qpos[:, column].copy()
+        before, q, warned = self._time, rows.qpos[:, column].copy(), rows.warnings
         aim = self._targets(action.astype(float))
         self._hand.advance(self._aim, aim, ids)
         self._aim = aim
+        warned = np.maximum(rows.warnings - warned, 0)
+        self._warned = warned.sum(1)
         moved = (rows.qpos[:, column] - q) / self._stroke
         self._push = self._touch()
         contact, load = self._push[:, 0] > 0, self._push[:, 4]
         driven = np.where((moved > 0) & (load * self._stroke > 0), moved, 0.0)
         self._mark(before, contact)
         clock = rows.time
-        # MuJoCo begins anew, its clock at zero, where a state is no longer finite.
-        self._diverged = self._diverged | (clock < self._clock + (SUBSTEPS - 0.5) * TIMESTEP)
+        # MuJoCo begins anew, its clock at zero, where a state is no longer finite, and warns.
+        self._diverged = (self._diverged | warned[:, BAD].any(1)
+                          | (clock < self._clock + (SUBSTEPS - 0.5) * TIMESTEP))
         self._clock = clock
         self._driven = self._driven + driven
         success = self.success()
@@ -294,7 +298,8 @@ class Task:
         return {"joint_progress": self.asset.progress(q),
                 "final_q_error": np.abs(q - demo["q_demo_end"]) / (demo["q_max"] - demo["q_min"]),
                 "is_success": self._succeeded.copy(), "success_now": self.success(), "contact": self._push[:, 0] > 0,
-                "contact_fraction": (wanted & self._hit).sum(1) / np.maximum(count, 1), "diverged": self.diverged}
+                "contact_fraction": (wanted & self._hit).sum(1) / np.maximum(count, 1), "diverged": self.diverged,
+                "warnings": self._warned.copy()}
 
     def observation(self) -> np.ndarray:
         """(n, size) float32, flat, clipped to [-10, 10]; a new array. See :class:`taa_envs.motion.Layout`."""
