@@ -42,6 +42,10 @@ test: install
 assets: install
 	$(BIN)/python -m benchmarks.build_assets --work build/assets
 
+docs: install
+	$(BIN)/python -m mkdocs build --strict --quiet
+	@echo "open site/index.html"
+
 check: install
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -58,4 +62,4 @@ lock:
 	  $(addprefix --no-emit-package ,$(LEFT_OUT)) --output-file requirements.lock
 
 clean:
-	rm -rf .venv $(DEMO) build dist
+	rm -rf .venv $(DEMO) build dist site
