@@ -16,7 +16,7 @@ SAYS = {
     "02": "success True",
     "03": "progress of the replay",
     "04": "stops half-way: progress 50%",
-    "05": "1024 steps",
+    "05": "open-loop replay",
     "06": "ok: revolute",
 }
 
