@@ -15,14 +15,15 @@ import numpy as np
 from reconstruct.cues import HandReference, Hands, LinkMasks
 from reconstruct.geometry import Geometry
 from reconstruct.hand.drive import Drive, close_gaps, find_drive, moving_frames, runs
-from reconstruct.hand.grip import ACROSS_STD, RADII, RAY_STD, Grip, find_grips
+from reconstruct.hand.grip import ACROSS_STD, PRESS, RADII, RAY_STD, Grip, find_grips
 from reconstruct.hand.path import clear_path, exit_direction
 from reconstruct.hand.pnp import hand_positions
-from reconstruct.hand.shape import LinkShape
+from reconstruct.hand.shape import LinkShape, drive_direction
 from reconstruct.hand.skeleton import ADULT_SIZE_STD, HAND_SIZE_STD, TIPS, bone_lengths, with_bone_lengths
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
+ONSET = 0.1  # s before the part moves in which a touching hand begins to press
 FOUND_SECONDS = 0.15  # a hand that holds on so soon after it is found was holding on before
 DEPTH_FLOOR, ACROSS_FLOOR = 0.01, 0.005  # m, least standard deviations of an aligned hand
 TIPS_STD = 0.005  # m of a finger tip: landmark noise of 4 % of a palm, and the 4 mm by which tips are pressed in
@@ -198,7 +199,8 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         notes.append("no face of the part looks against its motion within the hand's reach: pose left as seen")
         grips = [Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0, 0.0)]
     grip = grips[0]
-    joints = _assemble(fit, shape, world, pose, attached, grip, rest, rate)
+    held = _from_link(pose, grip.pose) - _waiting(fit, pose, grip, moving, sign, rate)
+    joints = _assemble(shape, world, held, pose, attached, grip, rate)
     notes.append(f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
                  f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was "
                  "seen")
@@ -229,11 +231,21 @@ def _stroke_sign(q: np.ndarray) -> float:
     return float(np.sign(demo["q_demo_end"] - demo["q_start"]))
 
 
-def _assemble(fit: JointFit, shape: LinkShape, world: np.ndarray, pose: np.ndarray, attached: np.ndarray, grip: Grip,
-              rest: np.ndarray, rate: float) -> np.ndarray:
-    """World landmarks (T, 21, 3): carried with the link while attached, as seen and clear of the link otherwise."""
+def _waiting(fit: JointFit, pose: np.ndarray, grip: Grip, moving: np.ndarray, sign: float, rate: float) -> np.ndarray:
+    """(T, 1, 3) m by which the hand is back from its grip: until the part moves it touches and does not press.
+
+    The joint's own motion says when the push begins; a hand that pressed while it waited would push too early.
+    """
+    onset = int(np.argmax(moving)) if moving.any() else 0
+    early = np.clip((onset - np.arange(len(pose))) / max(ONSET * rate, 1.0), 0.0, 1.0)
+    direction = drive_direction(fit, grip.pose[TIPS].mean(0), sign)
+    return ((PRESS + 0.001) * early * early * (3 - 2 * early))[:, None, None] * (pose[:, :3, :3] @ direction)[:, None]
+
+
+def _assemble(shape: LinkShape, world: np.ndarray, held: np.ndarray, pose: np.ndarray, attached: np.ndarray, grip: Grip,
+              rate: float) -> np.ndarray:
+    """World landmarks (T, 21, 3): the grip (``held``) while attached, as seen and clear of the link otherwise."""
     n = len(world)
-    held = _from_link(pose, grip.pose)
     out, offset = world.copy(), np.zeros_like(world)
     stretches = runs(attached)
     for a, b in stretches:

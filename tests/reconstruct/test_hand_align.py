@@ -32,14 +32,15 @@ def held_still(track: HandTrack, frame: int) -> HandTrack:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "seed"), [("demo", 0), ("laptop", 1), ("drawer", 1), ("oven", 0)])
+@pytest.mark.parametrize(("name", "seed"), [("demo", 0), ("laptop", 1), ("drawer", 1), ("oven", 0), ("puncher", 0)])
 def test_a_monocular_hand_becomes_one_that_drives_the_part(name: str, seed: int, tmp_path) -> None:
     scene = make_scene(name, seed)
     reference = align_hand(scene.video, scene.hands, scene.fit, scene.geometry)
     assert np.isfinite(reference.hand_joints).all()
     result = replayed(scene, reference, tmp_path)
     assert result["joint_progress"] >= 0.9
-    assert max(result["controls"].values()) < 0.1
+    # A hand that waits at the part, as on the short stroke of the puncher, touches it and does not press.
+    assert max(result["controls"].values()) <= 0.05
     assert result["contact_fraction"] > 0.8
     # Contact is claimed only while the true hand holds on, and in most of the frames in which it moves the part.
     moves = np.abs(np.gradient(scene.fit.q)) > 0.1 * np.abs(np.gradient(scene.fit.q)).max()
