@@ -27,6 +27,8 @@ PREFIX = "synth-"
 """Of the ids: an asset that a user calls ``drawer`` must not stand behind one of ours."""
 LEAST_PROGRESS = 0.5
 MAX_BYTES = 20_000_000
+LEFT_OUT = ("*.mp4", "report.html")
+"""Films weigh more than all else; ``--work`` keeps the whole folders."""
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- table: python -m benchmarks.build_assets -->", "<!-- end of the table -->"
 
@@ -114,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
             shutil.rmtree(target, ignore_errors=True)
             shutil.rmtree(target, ignore_errors=True)
             if row["asset"] is not None:
-                shutil.copytree(row["asset"], target, ignore=shutil.ignore_patterns("*.mp4"))
+                shutil.copytree(row["asset"], target, ignore=shutil.ignore_patterns(*LEFT_OUT))
                 row["bytes"] = size_of(target)
             row["asset"] = row["asset"] and str(row["asset"])
             (work / "rows" / f"{clip}.json").write_text(json.dumps(row))

@@ -30,6 +30,7 @@ from taa_envs.surface import Link, link_inertia, write_convex_part, write_textur
 
 # A video carries no forces: these are assumptions, and asset.json says so.
 DENSITY = 500.0  # kg/m3 of the closed surface: wood, or plastic and sheet with air between
+DENSITY_STD = 500.0  # kg/m3, a factor of two: from hollow plastic and thin sheet (100) to oak and glass (1000)
 STOP_TIME = 0.2  # s in which friction alone stops the link from the demonstration's speed
 DAMPING_TIME = 0.1  # s, time constant of viscous decay
 HAND_FORCE = (0.5, 8.0)  # N at the link's far end: least and most that friction, and as much that damping, may ask
@@ -261,8 +262,10 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
     force = "N" if kind == "prismatic" else "N m"
     made = {
         **_joint_provenance({**joint, "axis": axis, "q": ref.q}, limits, unit, joint_origin, joint_range is not None),
-        "moving.density": _entry(density if mass is None else body_mass / volume, "kg/m3", "assumed"),
-        "moving.mass": _entry(body_mass, "kg", "assumed" if mass is None else "given", None, inertia_note),
+        "moving.density": _entry(density if mass is None else body_mass / volume, "kg/m3", "assumed",
+                                 DENSITY_STD if mass is None else None),
+        "moving.mass": _entry(body_mass, "kg", "assumed" if mass is None else "given",
+                              DENSITY_STD * volume if mass is None else None, inertia_note),
         "joint.damping": _entry(numbers["damping"], f"{force} s/{unit}", "assumed" if damping is None else "given"),
         "joint.frictionloss": _entry(numbers["frictionloss"], force, "assumed" if frictionloss is None else "given"),
         "joint.armature": _entry(numbers["armature"], "kg" if kind == "prismatic" else "kg m2", "assumed"),

@@ -1,4 +1,4 @@
-"""Convex parts, mass, and the proof that the two links stay clear of each other."""
+"""Convex parts, and the proof that the two links stay clear of each other."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from reconstruct.joint.models import JointFit
 
 Part = tuple[np.ndarray, np.ndarray]
 MAX_PARTS = 16
-DENSITY = 300.0
-"""kg/m3 of a household part taken as solid (hollow plastic, chipboard and sheet metal lie between 100 and 700)."""
 
 
 def convex_parts(vertices: np.ndarray, faces: np.ndarray, limit: int = MAX_PARTS,
@@ -130,13 +128,3 @@ def contacts_over_range(moving: tuple[Part, ...], static: tuple[Part, ...], fit:
                 count += 1
                 depth = max(depth, -float(c.dist) * size)
     return {"states": states, "contacts": count, "penetration": depth}
-
-
-def mass_properties(vertices: np.ndarray, faces: np.ndarray, density: float = DENSITY) -> dict:
-    """{"mass" kg, "com" (3,) m, "inertia" (3, 3) kg m2 about it, world axes, "density"} of a solid of one density."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.density = density
-    return {"mass": float(mesh.mass), "com": np.asarray(mesh.center_mass), "inertia": np.asarray(mesh.moment_inertia),
-            "density": density}

@@ -11,7 +11,7 @@ from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.geometry.atlas import make_atlas
 from reconstruct.geometry.block import place_block
-from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
+from reconstruct.geometry.collision import contacts_over_range, convex_parts, trim_parts
 from reconstruct.geometry.layers import frame_costs, spread_frames
 from reconstruct.geometry.masks import points_on_mask
 from reconstruct.geometry.outline import build_shape
@@ -86,7 +86,6 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
     moving = _finish(video, fit, masks, costs, vertices, faces, parts, True, [])
     static = _finish(video, fit, masks, costs, s_vertices, s_faces, s_parts, False,
                      [(moving.vertices, moving.faces, True)], block.seen)
-    inertia = mass_properties(vertices, faces)
     words = "a block behind the moving part's closed pose"
     words += ", cut to the body's outline in the picture" if block.seen is not None else ""
     notes.append(f"the static link's depth and sides were not seen: it is {words}")
@@ -108,10 +107,6 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         "moving_silhouette_iou": entry(shape.iou, "observed"),
         "moving_reach_to_hand": entry(shape.reach, "fitted" if shape.reach else "assumed", unit=unit),
         "moving_seen_faces": entry(float(1 - moving.assumed.mean()), "observed"),
-        "moving_density": entry(inertia["density"], "assumed", unit="kg/m3"),
-        "moving_mass": entry(inertia["mass"], "assumed", unit="kg"),
-        "moving_com": entry(inertia["com"].tolist(), "assumed", unit=unit),
-        "moving_inertia": entry(inertia["inertia"].tolist(), "assumed", unit="kg m2"),
         "moving_parts": entry(convexity["parts"], "fitted", **{k: v for k, v in convexity.items() if k != "parts"}),
         "static_depth": entry(block.depth, "assumed", unit=unit),
         "static_closed_at": entry(block.end, "fitted" if block.decided else "assumed", unit=fit.unit,

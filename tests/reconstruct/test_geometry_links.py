@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from reconstruct.errors import TaaError
-from reconstruct.geometry.collision import contacts_over_range, convex_parts, mass_properties, trim_parts
+from reconstruct.geometry.collision import contacts_over_range, convex_parts, trim_parts
 from reconstruct.geometry.links import build_geometry
 from reconstruct.geometry.masks import segment_links
 from reconstruct.geometry.plane import fit_plane
@@ -151,10 +151,3 @@ def test_convex_parts_of_an_angle_iron():
     assert abs(report["volume_error"]) < 0.1
     whole, report = convex_parts(*a)
     assert len(whole) == 1 and abs(report["volume_error"]) < 1e-6
-
-
-def test_mass_of_a_box():
-    out = mass_properties(*_box([0, 0, 0], [0.2, 0.1, 0.05]), density=500)
-    assert out["mass"] == pytest.approx(0.5)
-    assert np.allclose(out["com"], [0.1, 0.05, 0.025])
-    assert out["inertia"][2, 2] == pytest.approx(0.5 / 12 * (0.2**2 + 0.1**2))

@@ -17,7 +17,7 @@ from reconstruct.synth.staging import skin_radii
 from reconstruct.synth.truth import write_mjcf
 
 SIZE = (240, 136)
-JOINTED = ["demo", "drawer", "laptop", "oven", "monitor", "stapler", "puncher", "cabinet", "box"]
+JOINTED = ["demo", "drawer", "laptop", "oven", "monitor", "stapler", "puncher", "cabinet", "box", "locker", "crate"]
 
 
 @pytest.fixture(scope="module")
