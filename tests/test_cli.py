@@ -15,6 +15,7 @@ import pytest
 
 from taa_envs import cli
 from taa_envs.asset import save_asset
+from taa_envs.registry import shipped_folder
 from tests.taa_envs.made import door_arguments
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,7 +60,8 @@ def test_usage_errors_exit_with_2(args, capsys):
 
 def test_list_and_show(taa):
     code, out, _ = taa("list", "--json")
-    assert code == 0 and [a["id"] for a in json.loads(out)["assets"]] == ["door"]
+    shipped = {folder.parent.name for folder in shipped_folder().glob("*/asset.json")}
+    assert code == 0 and {a["id"] for a in json.loads(out)["assets"]} == {"door", *shipped}
     code, out, _ = taa("show", "door", "--json")
     shown = json.loads(out)
     assert code == 0 and shown["joint"]["type"] == "revolute" and shown["provenance"]
