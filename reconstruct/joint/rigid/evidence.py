@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,8 +35,9 @@ class Evidence:
 
 
 def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, inflation: float,
-                folds: int = 2, blocks: int = 10) -> Evidence:  # fmt: skip
+                lost: Collection[str] = (), folds: int = 2, blocks: int = 10) -> Evidence:  # fmt: skip
     """Probability of each type; `obs` holds only what agrees with the best one, so that nothing flips in or out.
+    Types in `lost` are far behind and judged as they are.
 
     The frames are cut into blocks; each fold is fitted without every other block, and the left-out frames are then
     explained with the joint and the points fixed and only their states and depth errors free. A difference of these
@@ -49,7 +51,11 @@ def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, infla
     for fold in range(folds):
         out = block == fold
         for kind, st in states.items():
-            heldout[kind] += _heldout(st, obs, noise, out) / 2 / inflation
+            if kind not in lost:
+                heldout[kind] += _heldout(st, obs, noise, out) / 2 / inflation
+    for kind in lost:  # not fitted again: by what it leaves where it was fitted
+        r, _, _ = residuals(states[kind], obs, noise)
+        heldout[kind] = weigh(r, obs, np.inf)[1] / 2 / inflation
     occam = {kind: _occam(st, obs, noise, inflation) for kind, st in states.items()}
     score = {kind: np.log(PRIOR[kind]) - heldout[kind] - occam[kind] for kind in states}
     top = max(score.values())

@@ -19,6 +19,10 @@ KEYS, SAMPLE = 24, 150
 """Frames and tracks of the search; the last refinements take all."""
 DECIDE_FRAMES, DECIDE_TRACKS = 32, 160
 CERTAIN = 0.9
+TRIES = {"prismatic": 2, "revolute": 3, "screw": 1}
+"""Hypotheses of each type that are refined; a screw is also started from the best hinge."""
+HOPELESS = 400.0
+"""A type whose robust cost is so much above the best one's needs no closer look."""
 AGREE = 0.35
 """Share of the link's observations that has to agree with the joint."""
 SURE = 0.9
@@ -126,7 +130,7 @@ def _search(found: list, poses: Poses, obs: Observations, field: np.ndarray, key
     out: dict[str, tuple[float, State]] = {}
     tried: dict[str, list] = {kind: [] for kind in KINDS}
     for twist, s in found:
-        if len(tried[twist.kind]) >= 3 or any(_alike(twist, t) for t in tried[twist.kind]):
+        if len(tried[twist.kind]) >= TRIES[twist.kind] or any(_alike(twist, t) for t in tried[twist.kind]):
             continue
         tried[twist.kind].append(twist)
         full = np.interp(np.arange(len(keys)), poses.frames, s)
@@ -136,8 +140,9 @@ def _search(found: list, poses: Poses, obs: Observations, field: np.ndarray, key
         if twist.kind not in out or cost < out[twist.kind][0]:
             out[twist.kind] = (cost, st)
     states = {}
-    for kind, (_, st) in out.items():
-        for scale in (4.0, 2.5):
+    least = min(cost for cost, _ in out.values())
+    for kind, (cost, st) in out.items():
+        for scale in (4.0, 2.5) if cost < 2 * least + HOPELESS else ():
             st, cost = refine(st, some, noise, scale, iterations=5, tolerance=1e-3)
         states[kind] = (cost, st)
     kind = min(states, key=lambda k: states[k][0])
@@ -175,13 +180,16 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
     good, _ = weigh(r, obs, None)
     inflation = correlation(r, good > 0)
     last = {st.twist.kind: st}
+    least = min(cost for _, cost in first.values())
+    lost = {kind for kind, (_, cost) in first.items() if cost > least + HOPELESS * inflation}
+    last |= {kind: first[kind][0] for kind in lost}
     for kind in KINDS:
-        if kind != st.twist.kind:
+        if kind not in last:
             starts = [_as_kind(st, kind), *([first[kind][0]] if kind in first else [])]
             options = [refine(o, obs, noise, 3.0, iterations=4, tolerance=1e-3) for o in starts]
             last[kind] = refine(min(options, key=lambda o: o[1])[0], obs, noise, None, iterations=4)[0]
     agreed = replace(obs, seen=good > 0, ranged=obs.ranged & (good > 0))
-    probability = weigh_types(last, agreed, noise, inflation).probability
+    probability = weigh_types(last, agreed, noise, inflation, lost).probability
     return last[max(probability, key=probability.get)], probability, noise
 
 

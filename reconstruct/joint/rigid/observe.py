@@ -104,13 +104,18 @@ def static_field(obs: Observations, rounds: int = 4) -> tuple[np.ndarray, Noise]
 def robust_mean(points: np.ndarray, rounds: int = 3) -> np.ndarray:
     """(N, 3) means over frames of (N, T, 3) points (NaN where unknown) with far ones weighed down."""
     finite = np.isfinite(points[..., 0])
-    mean = np.zeros((len(points), 3))
-    some = finite.any(1)
-    mean[some] = np.nanmedian(points[some], axis=1)
+    mean = np.nan_to_num(_median(points))
     values = np.where(finite[..., None], points, 0.0)
     for _ in range(rounds):
         d2 = np.sum((values - mean[:, None]) ** 2, axis=-1)
-        middle = np.array([np.median(d[f]) if f.any() else 1.0 for d, f in zip(d2, finite, strict=True)])
+        middle = np.nan_to_num(_median(np.where(finite, d2, np.nan)), nan=1.0)
         w = finite / (1 + d2 / (4 * middle[:, None] + 1e-12)) ** 2
         mean = np.einsum("nt,ntj->nj", w, values) / np.maximum(w.sum(1), 1e-12)[:, None]
     return mean
+
+
+def _median(x: np.ndarray) -> np.ndarray:
+    """Lower median over axis 1 of what is not NaN; NaN where nothing is."""
+    ordered = np.sort(x, axis=1)  # NaN last
+    count = np.isfinite(x).sum(axis=1, keepdims=True)
+    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=1)[:, 0]
