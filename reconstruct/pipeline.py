@@ -204,6 +204,9 @@ def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: fl
         seen = look(video, scene, focal, seed, stages, scratch)
         if seen.fit.verdict == "refused":
             raise Refused(with_advice(seen.fit.reason))
+        if seen.fit.type == "screw":
+            raise Refused(f"the part moves as a screw ({seen.fit.pitch:.3g} m/rad), and an asset holds a hinge or a "
+                          "slide; read the joint itself with taa fit")  # fmt: skip
     except Refused as refusal:
         fit = seen.fit if seen is not None else None
         joint = joint_object(fit, video.index) if fit is not None and video is not None else refused_joint(str(refusal))

@@ -120,7 +120,8 @@ def bound(given: Given, focal_known: bool = True) -> Bound:
         H += np.mean(np.diag(H)[free]) / n2 * np.outer(gauge, gauge)
     cov = np.zeros((size, size))
     part = H[np.ix_(free, free)]
-    scale = 1 / np.sqrt(np.maximum(np.diag(part), 1e-300))
+    held = np.diag(part)
+    scale = 1 / np.sqrt(np.maximum(held, 1e-15 * held.max()))
     # What nothing holds (the states of frames that share no point with the others) has a huge variance, not none.
     values, vectors = np.linalg.eigh(part * scale[:, None] * scale)
     inverted = (vectors / np.maximum(values, 1e-12)) @ vectors.T

@@ -49,12 +49,13 @@ def score(given: Given, answer: Answer, best: Bound | None) -> dict:
     sign = 1.0 if scene.axis @ answer.axis >= 0 else -1.0
     row |= {"location_mm": None, "centroid_mm": None, "q_deg": None, "q_mm": None}
     error = sign * answer.q - truth
+    shown = (scene.visible & scene.moving[:, None]).sum(0) >= 3
     if answer.type != kind:
         row["q_deg" if hinge else "q_mm"] = FAILED_DEG if hinge else 1e3 * FAILED_M
     elif hinge:
-        row["q_deg"] = float(np.degrees(np.sqrt(np.mean(error**2))))
+        row["q_deg"] = float(np.degrees(np.sqrt(np.mean(error[shown] ** 2))))
     else:
-        row["q_mm"] = float(1e3 * np.sqrt(np.mean(error**2)))
+        row["q_mm"] = float(1e3 * np.sqrt(np.mean(error[shown] ** 2)))
     centre = foot(scene)
     miss = None
     if hinge:

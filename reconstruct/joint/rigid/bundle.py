@@ -59,15 +59,18 @@ def weigh(r: np.ndarray, obs: Observations, scale: float | None) -> tuple[np.nda
     return obs.seen * g**2, float(np.sum(obs.seen * scale**2 * (1 - g)))
 
 
-def bending(s: np.ndarray) -> float:
+def bending(st: State, obs: Observations) -> float:
     """Information on a second difference of the states, from how they bend: 1 / (1.5 x the 90 % quantile)^2.
 
     Hands move things smoothly, so that states that few tracks hold, or that none ties to the others, follow their
-    neighbours. Straight motion costs nothing, so the end points are kept.
+    neighbours. Straight motion costs nothing, so the end points are kept. Only frames that see the link tell how it
+    moves.
     """
-    if len(s) < 5:
-        return 0.0
-    return float(1 / max(1.5 * np.quantile(np.abs(np.diff(s, 2)), 0.9), 1e-5 * np.ptp(s), 1e-12) ** 2)
+    seen = obs.seen[obs.link].sum(0) >= 3
+    bent = np.abs(np.diff(st.s, 2))[seen[2:] & seen[1:-1] & seen[:-2]]
+    if len(bent) < 5:
+        return loose(st.s)
+    return float(1 / max(1.5 * np.quantile(bent, 0.9), 1e-5 * np.ptp(st.s), 1e-12) ** 2)
 
 
 def loose(s: np.ndarray) -> float:

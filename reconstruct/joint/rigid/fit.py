@@ -81,7 +81,7 @@ def fit_rigid(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndar
     whole = _spread(best, frames, every, obs, field)
     whole, _ = refine(whole, obs, told, 3.0, iterations=3, tolerance=1e-3)
     best, kept, noise = _polish(whole, obs, told)
-    best, _ = refine(best, kept, noise, None, iterations=5, stiff=bending(best.s), tolerance=1e-7)
+    best, _ = refine(best, kept, noise, None, iterations=5, stiff=bending(best, kept), tolerance=1e-7)
     reason = _why_not(best, obs, noise, poses, world, keys, part)
     if reason:
         return replace(_refused(reason, N), type_probability=probability)
@@ -282,7 +282,7 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
     T = len(st.s)
     r, X, cam = residuals(st, obs, noise)
     w, _ = weigh(r, obs, None)
-    n = normal_equations(st, obs, noise, r, X, cam, w, bending(st.s))
+    n = normal_equations(st, obs, noise, r, X, cam, w, bending(st, obs))
     cov_joint, cov_mixed, cov_states = covariance(n, n.d + OWN * st.anchor)
     link = obs.link & (w.sum(1) >= 2)
     pose0 = st.twist.poses(st.s[:1])[0]
