@@ -20,10 +20,11 @@ def score(given: Given, answer: Answer, best: Bound | None) -> dict:
 
     Returns:
         axis_deg; location_mm, between the two infinite lines; centroid_mm, distance of the fitted axis from the true
-        one's point nearest to the moving link's centroid; q_deg or q_mm, RMS over the frames; point_mm, RMS over frames
-        and moving points of the induced displacement's error, and point_share of the object's diagonal; ratio_axis and
-        ratio_location, error over the median error of an estimator at the Cramer-Rao bound; covered_*, whether the
-        stated 95 % interval holds the truth (for q the share of frames).
+        one's point nearest to the moving link's centroid; q_deg or q_mm, RMS over the frames in which the object itself
+        does not hide the link; point_mm, RMS over the same frames and all moving points of the induced displacement's
+        error, and point_share of the object's diagonal; ratio_axis and ratio_location, error over the median error of
+        an estimator at the Cramer-Rao bound; covered_*, whether the stated 95 % interval holds the truth (for q the
+        share of frames).
     """
     scene, model = given.scene, given.scene.model
     kind, hinge = model.kind, model.kind == "revolute"
@@ -68,7 +69,7 @@ def score(given: Given, answer: Answer, best: Bound | None) -> dict:
     X = scene.points[scene.moving]
     moved = lambda T: np.einsum("tij,nj->tni", T[:, :3, :3], X) + T[:, None, :3, 3]  # noqa: E731
     gap = np.linalg.norm(moved(answer.link_pose) - moved(scene.link_poses()), axis=-1)
-    row["point_mm"] = float(1e3 * np.sqrt(np.mean(gap**2)))
+    row["point_mm"] = float(1e3 * np.sqrt(np.mean(gap[shown] ** 2)))
     row["point_share"] = row["point_mm"] / 1e3 / scene.diagonal
     if row["type_right"]:
         row |= _coverage(row, answer, error)
