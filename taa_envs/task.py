@@ -107,6 +107,10 @@ class Task:
         """(n,) s, the reference's clock."""
         return self._time.copy()
 
+    def landmarks(self) -> np.ndarray:
+        """(n, 21, 3) m, where the hand's landmarks are; a copy."""
+        return self._hand.landmarks().copy()
+
     def path(self, t: np.ndarray) -> np.ndarray:
         """(..., 21, 3) m: the demonstrated landmarks at times t (...), s of the reference."""
         time = self._times

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
@@ -65,6 +67,51 @@ def test_made_by_name(asset_root, door: Asset, monkeypatch: pytest.MonkeyPatch) 
         assert env.observation_space.contains(observation)
         np.testing.assert_array_equal(observation[0], observation[1])
         env.close()
+    finally:
+        monkeypatch.undo()
+        taa_envs.register_assets()
+
+
+def test_every_registered_id_passes_the_checkers(asset_root, door: Asset, drawer: Asset,
+                                                 monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gymnasium's and Stable-Baselines3's, one simulation and many: the shipped assets and the tests' own."""
+    from gymnasium.utils.env_checker import check_env
+    from stable_baselines3.common.env_checker import check_env as check_sb3
+    from stable_baselines3.common.vec_env import VecCheckNan
+
+    from train.vec import BatchedVecEnv
+
+    monkeypatch.setenv("TAA_ASSETS", str(asset_root))
+    ids = taa_envs.register_assets()
+    try:
+        assert {"TAA/door", "TAA/drawer"} <= set(ids)
+        for env_id in ids:
+            env = gymnasium.make(env_id).unwrapped
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
+                check_env(env, skip_render_check=True)
+                check_sb3(env)
+            many = gymnasium.make_vec(env_id, 2, vectorization_mode="vector_entry_point", autoreset_mode="same_step",
+                                      max_episode_steps=4)
+            many.action_space.seed(0)
+            seen, info = many.reset(seed=0)
+            kept = seen.copy()
+            for _ in range(9):  # over the ends of two episodes
+                assert many.observation_space.contains(seen) and seen.dtype == np.float32
+                step = many.step(many.action_space.sample())
+                seen = step[0]
+                assert [np.shape(x) for x in step[1:4]] == [(2,)] * 3
+                assert step[2].dtype == step[3].dtype == bool
+                assert all(np.shape(v) == (2,) for k, v in step[4].items() if k[:1] != "_" and isinstance(v, np.ndarray)
+                           and k != "final_obs")
+            assert not np.array_equal(kept, seen)
+            np.testing.assert_array_equal(many.reset(seed=0)[0], kept)  # and nothing handed out was written to
+            face = VecCheckNan(BatchedVecEnv(many.unwrapped), raise_exception=True)
+            face.reset()
+            for _ in range(5):
+                face.step(np.zeros((2, 8), np.float32))
+            many.close()
     finally:
         monkeypatch.undo()
         taa_envs.register_assets()
