@@ -2,6 +2,7 @@
 
     python -m benchmarks.geometry                         # every object, renders and reconstructs it
     python -m benchmarks.geometry --only microwave --work build/geometry --pictures docs/images
+    python -m benchmarks.geometry --shipped               # the assets that ship, against the clips they were made from
 
 Each object of furniture_sim is rendered with a hand (:mod:`benchmarks.furniture`), reconstructed from the video and
 compared: Chamfer distance (mean of both directions' mean nearest distances, outer surfaces) of the moving link at the
@@ -20,6 +21,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
+from reconstruct.synth.animation import look_at
 
 SAMPLES = 20_000
 SIZE = (768, 432)
@@ -61,16 +64,32 @@ def into_truth(points: np.ndarray, T_camera_world: np.ndarray, truth_camera: np.
     return (camera / scale) @ back[:3, :3].T + back[:3, 3]
 
 
-def score(clip, truth, joint: dict, geometry) -> dict:
-    """Chamfer distance of the moving link at frame 0 as shares of its true diagonal, and what else there is to say."""
+def meshes_of(clip) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Vertices and faces of the solids of a clip's moving link at frame 0."""
+    import trimesh
+
+    from reconstruct.synth.objects import Solid
+
+    out = []
+    for solid in clip.model.boxes:
+        if solid.link == "moving":
+            mesh = solid if isinstance(solid, Solid) else trimesh.convex.convex_hull(solid.corners())
+            out.append((np.array(mesh.vertices), np.array(mesh.faces)))
+    return out
+
+
+def score(clip, truth, joint: dict, surface) -> dict:
+    """Chamfer distance of the moving link at frame 0 as shares of its true diagonal, and what else there is to say.
+
+    Args:
+        surface: has vertices (V, 3) and faces (F, 3) of the found link, in the found world at q = 0.
+    """
     from benchmarks.clips import true_errors
 
-    true_solids = [(b.vertices, b.faces) for b in clip.model.boxes if b.link == "moving"]
+    true_solids = meshes_of(clip)
     right = surface_points(true_solids)
     diagonal = float(np.linalg.norm(np.ptp(np.concatenate([v for v, _ in true_solids]), axis=0)))
     errors = true_errors(joint, truth) if joint["type"] == truth.type else {"scale": 1.0, "words": joint["type"]}
-    link = geometry.moving
-    surface = link.skin if link.skin is not None else link
     # The mesh stands at q = 0; the truth's solids are those of frame 0.
     from reconstruct.joint.models import joint_transform
 
@@ -104,7 +123,7 @@ def run(name: str, work: Path, pictures: Path | None) -> dict:
         row |= {"joint": made.joint["type"], "words": made.error or ""}
         if made.asset is not None:
             geometry = load_stage(scene / "stages" / "geometry.npz", None)
-            row |= score(clip, truth, made.joint, geometry)
+            row |= score(clip, truth, made.joint, geometry.moving)
             row["thickness"] = geometry.provenance["moving_thickness"]["origin"]
             row["progress"] = made.replay["joint_progress"]
             row["true_joint"] = with_true_joint(clip, truth, folder, scene)
@@ -139,7 +158,7 @@ def with_true_joint(clip, truth, folder: Path, scene: Path) -> float | None:
             geometry = build_geometry(video, hands, tracks, exact, masks)
         except TaaError:
             return None
-    return score(clip, truth, joint_object(exact, None), geometry)["chamfer"]
+    return score(clip, truth, joint_object(exact, None), geometry.moving)["chamfer"]
 
 
 def true_scale(joint: dict, truth) -> float:
@@ -175,6 +194,32 @@ def draw(truth, asset, file: Path, frames: int = 3) -> None:
     cv2.imwrite(str(file), cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
+def shipped() -> list[dict]:
+    """A row for each asset that ships: its moving link against the clip that it was made from."""
+    from types import SimpleNamespace
+
+    from benchmarks.build_assets import CLIPS, PREFIX
+    from reconstruct.synth.clips import build_clip
+    from taa_envs.asset import load_asset
+    from taa_envs.exports.usd import read_obj
+    from taa_envs.registry import shipped_folder
+
+    rows = []
+    for name in CLIPS:
+        folder = shipped_folder() / (PREFIX + name)
+        if not folder.is_dir():
+            continue
+        asset, clip = load_asset(folder), build_clip(name)
+        vertices, faces, _ = read_obj(folder / "meshes" / "moving.obj")
+        truth = SimpleNamespace(type=clip.model.kind, axis=clip.model.axis, point=clip.model.point,
+                                diagonal=clip.model.diagonal, q=np.array([0.0, clip.model.q_end]),
+                                T_camera_world=look_at(clip.camera, clip.target)[None])  # fmt: skip
+        row = {"object": name, "joint": asset.joint["type"], "words": ""}
+        row |= score(clip, truth, asset.joint, SimpleNamespace(vertices=vertices, faces=faces))
+        rows.append({**row, "thickness": asset.provenance["moving_thickness"]["origin"]})
+    return rows
+
+
 def table(rows: list[dict]) -> str:
     """Markdown, one line an object, failures with nothing but their words."""
     out = ["| object | joint | axis | Chamfer / diagonal | found to true | true to found | true joint | thickness "
@@ -199,7 +244,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=names or None, default=names)
     parser.add_argument("--work", type=Path, help="keeps clips, scenes and rows, so that a second run resumes")
     parser.add_argument("--pictures", type=Path, help="folder to draw each object into")
+    parser.add_argument("--shipped", action="store_true", help="measure the assets that ship instead")
     arguments = parser.parse_args(argv)
+    if arguments.shipped:
+        print(table(shipped()))
+        return 0
     if not names:
         print(f"error: no furniture in {FOLDER}; put furniture_sim there", file=sys.stderr)
         return 1
