@@ -400,7 +400,7 @@ class Reconstruct(Job):
                     "-i",
                     str(clip / "video.mp4"),
                     "-vf",
-                    "scale=480:-2",
+                    "fps=15,scale=384:-2",
                     str(self.folder / "clip.mp4"),
                 ],
                 check=True,
