@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from reconstruct.cues import ProviderInfo
-from reconstruct.cues_io import CueFolder
+from reconstruct.cues_io import CueFolder, read_mesh
 from reconstruct.errors import TaaError
+from reconstruct.providers.grounding import ground_tracks
 from reconstruct.providers.released import HandFrames, ReleasedScene
 from reconstruct.providers.table import find
 from reconstruct.providers.world import upright
@@ -21,7 +22,8 @@ NEAR = 0.03
 """Share of its depth by which a tracked point may lie behind the depth map and still count as seen."""
 
 
-def import_scene(source: str | Path, scene: str | Path, label: str | None = None, rate: float = 30.0) -> dict:
+def import_scene(source: str | Path, scene: str | Path, label: str | None = None, rate: float = 30.0,
+                 ground: bool = False) -> dict:  # fmt: skip
     """Read a released scene folder into ``scene/cues``.
 
     Args:
@@ -29,6 +31,8 @@ def import_scene(source: str | Path, scene: str | Path, label: str | None = None
         scene: our scene folder, made where it is not there.
         label: which moving part; needed where several move.
         rate: frames a second of ``frames/``, which the folder does not say.
+        ground: put the tracks onto the key frames' meshes (``sam3d_scaled/``): the first meeting of a pixel's ray
+            with the mesh takes the place of the lifted depth.
 
     Returns:
         {"scene", "frames", "size", "label", "cues": {name: what it was made from}, "missing": [..], "joints": {..},
@@ -66,7 +70,7 @@ def import_scene(source: str | Path, scene: str | Path, label: str | None = None
         put("depth", {"depth": depth, "metric": np.array(metric)}, _info("da3", model, "depth"), "da3/depth")
     _masks(found, size, moving, put)
     if cameras is not None:
-        _tracks(found, size, moving, cameras, world, depth, put)
+        _tracks(found, size, moving, cameras, world, depth, put, notes, ground)
         _hand(found, size, cameras, world, put, notes)
         _meshes(found, moving, cameras[1], world, put, notes)
     elif (found.folder / "trackcraft").is_dir() or found.hand() is not None:
@@ -137,7 +141,7 @@ def _masks(found: ReleasedScene, size: tuple[int, int], moving: str | None, put:
 
 
 def _tracks(found: ReleasedScene, size: tuple[int, int], moving: str | None, cameras: tuple[np.ndarray, np.ndarray],
-            world: np.ndarray, depth: np.ndarray | None, put: Any) -> None:  # fmt: skip
+            world: np.ndarray, depth: np.ndarray | None, put: Any, notes: list[str], ground: bool) -> None:  # fmt: skip
     parts = [(label, found.tracks(label)) for label, motion in found.labels().items()
              if label == moving or motion == "static"]  # fmt: skip
     parts = [(label, xyz) for label, xyz in parts if xyz is not None]
@@ -150,6 +154,13 @@ def _tracks(found: ReleasedScene, size: tuple[int, int], moving: str | None, cam
         surface = sample_depth(depth, uv, size)
         visible &= ~(z > surface * (1 + NEAR))
     uv = np.where(visible[..., None], uv, np.nan)
+    if ground:
+        keys = {}
+        for frame, (file, T_camera_glb) in found.key_meshes().items():
+            vertices, faces, _ = read_mesh(file)
+            keys[frame] = vertices @ T_camera_glb[:3, :3].T + T_camera_glb[:3, 3], faces
+        xyz, count = ground_tracks(xyz, uv, visible, keys, *cameras)
+        notes.append(f"{count} places of tracks in {len(keys)} key frames were put onto the meshes")
     arrays = {"uv": uv.astype(np.float32), "visible": visible,
               "xyz_world": (xyz @ world[:3, :3].T + world[:3, 3]).astype(np.float32)}  # fmt: skip
     put("tracks", arrays, _info("trackcraft3r", "", "tracks"), "trackcraft/")

@@ -104,9 +104,11 @@ class ImportScene(Common):
     """The moving part, where several move."""
     rate: float = 30.0
     """Frames a second at which its frames were extracted."""
+    ground: bool = False
+    """Put the tracks onto the key frames' meshes (sam3d_scaled/)."""
 
     def run(self) -> Outcome:
-        return commands.import_scene(self.source, self.scene, self.label, self.rate)
+        return commands.import_scene(self.source, self.scene, self.label, self.rate, self.ground)
 
 
 @dataclass(kw_only=True)

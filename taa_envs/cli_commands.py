@@ -114,10 +114,10 @@ def fit(scene: Path, focal: float | None, out: Path | None, seed: int) -> Outcom
     return Outcome(joint, lambda: _table(f"{scene}: {joint['verdict']}", _joint_rows(joint)), refused)
 
 
-def import_scene(source: Path, scene: Path, label: str | None, rate: float) -> Outcome:
+def import_scene(source: Path, scene: Path, label: str | None, rate: float, ground: bool) -> Outcome:
     from reconstruct.import_scene import import_scene as run
 
-    data = run(source, scene, label, rate)
+    data = run(source, scene, label, rate, ground)
 
     def words() -> None:
         _table(f"{scene}: {data['frames']} frames of {data['size'][0]} x {data['size'][1]} px",

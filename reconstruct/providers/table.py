@@ -99,7 +99,9 @@ PROVIDERS: dict[str, tuple[Provider, ...]] = {
                  weights="Apache-2.0 (Small); Base and Large are CC-BY-NC-4.0", **_TRANSFORMERS),
         Provider("depth", "moge", "library", "MoGe-2, metric, frame by frame", code="MIT", weights="MIT",
                  modules=("torch", "moge"), extra="moge", model="Ruicheng/moge-2-vitl",
-                 get="pip install 'taa-envs[moge]' and pip install --no-deps git+https://github.com/microsoft/MoGe"),
+                 get="pip install 'taa-envs[moge]' and pip install --no-deps git+https://github.com/microsoft/MoGe "
+                     "git+https://github.com/EasternJournalist/utils3d",
+                 apart="its own requirement opencv-python overwrites opencv-python-headless, hence --no-deps"),
     ),
     "hand": (
         Provider("hand", "mediapipe", "embedded", "MediaPipe's palm and landmark networks, followed in both directions",

@@ -121,3 +121,64 @@ def environment(folder: Path, name: str, script: str, text: str, truth: dict[str
     (repository / "weights.safetensors").write_text("weights")
     return {"python": str(python), "repository": str(repository), "checkpoint": str(repository / "weights.safetensors"),
             "pipeline": str(repository)}  # fmt: skip
+
+
+SAM3D = COMMON + '''
+import json
+import trimesh
+p = argparse.ArgumentParser()
+p.add_argument("--scene-dir", type=Path, required=True)
+p.add_argument("--sam3d-repo", type=Path, required=True)
+p.add_argument("--combined", action="store_true")
+p.add_argument("--overwrite", action="store_true")
+p.add_argument("--pointmap-source", choices=["moge", "da3"], default="moge")
+p.add_argument("--checkpoint-tag", default="hf")
+a = p.parse_args()
+word = mood(a.sam3d_repo)
+tracking = json.loads((a.scene_dir / "masks" / "tracking.json").read_text())
+assert a.combined and {e["motion"] for e in tracking.values()} == {"static", "moving"}
+keys = sorted({k for e in tracking.values() for k in e["keyframe_candidates"]})
+truth = np.load(a.sam3d_repo / "truth.npz")
+out = a.scene_dir / "sam3d" / "combined"
+if word == "nothing":
+    sys.exit(0)
+for n, k in enumerate(keys):
+    for label in tracking:
+        assert (a.scene_dir / "masks" / label / f"{k:06d}.png").is_file()
+    assert (a.scene_dir / "frames" / f"{k:06d}.jpg").is_file()
+    M = truth["T_world_moving"][k]
+    v = np.concatenate([truth["static_v"], truth["moving_v"] @ M[:3, :3].T + M[:3, 3]])
+    f = np.concatenate([truth["static_f"], truth["moving_f"] + len(truth["static_v"])])
+    C = truth["T_camera_world"][k]
+    v = (v @ C[:3, :3].T + C[:3, 3]) * (0.5 + 0.3 * n)  # right outline, its own distance in every frame
+    pose = json.loads((a.sam3d_repo / "pose.json").read_text())
+    G = np.asarray(json.loads((a.sam3d_repo / "matrix.json").read_text()))
+    there = (v - G[:3, 3]) @ np.linalg.inv(G[:3, :3]).T
+    folder = out / f"cand_{n:02d}_{k:06d}"
+    folder.mkdir(parents=True)
+    trimesh.Trimesh(there, f, process=False).export(folder / "mesh.glb")
+    (folder / "pose.json").write_text(json.dumps({} if word == "shapes" else pose))
+    (folder / "keyframe.txt").write_text(f"{k:06d}\\n")
+    (folder / "mask_labels.txt").write_text("\\n".join(tracking))
+'''
+
+SEGVIGEN = COMMON + '''
+import trimesh
+p = argparse.ArgumentParser()
+p.add_argument("--scene-dir", type=Path, required=True)
+p.add_argument("--segvigen-root", type=Path, required=True)
+p.add_argument("--ckpt-path", type=Path, required=True)
+p.add_argument("--overwrite", action="store_true")
+a = p.parse_args()
+word = mood(a.segvigen_root)
+assert a.ckpt_path.is_file() and (a.segvigen_root / "inference_full.py").is_file()
+count = len(np.load(a.segvigen_root / "truth.npz")["static_f"])
+for folder in sorted((a.scene_dir / "sam3d_scaled" / "combined").glob("cand_*")):
+    mesh = trimesh.load(folder / "mesh.glb", force="mesh", process=False)
+    out = a.scene_dir / "segvigen" / "combined" / folder.joinpath("keyframe.txt").read_text().strip() / "pieces"
+    out.mkdir(parents=True)
+    for label, faces in (("static", mesh.faces[:count]), ("moving", mesh.faces[count:])):
+        if word == "nothing" and label == "moving":
+            continue
+        trimesh.Trimesh(mesh.vertices, faces, process=False).export(out / f"{label}.glb")
+'''

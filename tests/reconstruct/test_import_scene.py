@@ -236,3 +236,39 @@ def test_frames_are_counted_by_name_and_by_place(imported):
     scene = ReleasedScene(source)
     assert scene.stems[0] == 1 and len(scene) == FRAMES
     assert sorted(scene.key_meshes()) == [0, FRAMES // 2]
+
+
+def test_tracks_are_put_onto_the_key_meshes(imported, truth, tmp_path):
+    """Depths of the tracks wrong by 4 % along their rays are mended in the key frames by the meshes, and only there."""
+    from reconstruct.synth.render import LINK_CODE
+    from tests.reconstruct.released_scenes import source_cameras
+
+    source = tmp_path / "source"
+    shutil.copytree(imported[0], source)
+    eye = source_cameras(truth)[:, :3, 3]
+    rng = np.random.default_rng(4)
+    for label in ("door", "body"):
+        folder = source / "trackcraft" / label
+        start = np.load(folder / "pts3d_ref.npy").astype(float)
+        wrong = rng.uniform(0.96, 1.04, (len(start), 1))
+        for file in (folder / "scene_flow").glob("*.npy"):
+            there = start + np.load(file)
+            t = int(file.stem)
+            np.save(file, (eye[t] + (there - eye[t]) * wrong - (eye[0] + (start - eye[0]) * wrong)).astype(np.float32))
+        np.save(folder / "pts3d_ref.npy", (eye[0] + (start - eye[0]) * wrong).astype(np.float32))
+    errors = {}
+    for ground in (False, True):
+        facts = import_scene(source, tmp_path / f"scene{ground}", ground=ground)
+        cue = cues_io.CueFolder(tmp_path / f"scene{ground}").read("tracks")
+        S = to_scene(facts)
+        own = np.concatenate([np.flatnonzero((truth.tracks["link"] == LINK_CODE[part]) & truth.tracks["visible"][:, 0])
+                              for part in ("static", "moving")])  # fmt: skip
+        expected = truth.tracks["xyz_world"].astype(float) @ S[:3, :3].T + S[:3, 3]
+        gaps = np.linalg.norm(cue["xyz_world"][:, None, 0] - expected[own][None, :, 0], axis=-1)
+        assert len(gaps) == len(own)
+        for key in (0, FRAMES // 2, 2):
+            seen = cue["visible"][:, key]
+            gap = np.linalg.norm(cue["xyz_world"][:, key] - expected[own][:, key], axis=-1)[seen]
+            errors[ground, key] = float(np.median(gap))
+    assert errors[True, 0] < 0.1 * errors[False, 0] and errors[True, FRAMES // 2] < 0.2 * errors[False, FRAMES // 2]
+    assert errors[True, 2] == pytest.approx(errors[False, 2])
