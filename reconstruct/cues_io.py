@@ -330,13 +330,23 @@ def meshes_from_cue(folder: Path, names: Iterable[str] = MESHES) -> dict[str, Li
     return links
 
 
-def moving_at_rest(link: LinkMesh, folder: CueFolder, fit: JointFit) -> LinkMesh:
+def scaled_link(link: LinkMesh, factor: float) -> LinkMesh:
+    """The link with all lengths about the world's origin multiplied."""
+    return replace(link, vertices=link.vertices * factor, parts=tuple((v * factor, f) for v, f in link.parts))
+
+
+def moving_at_rest(link: LinkMesh, folder: CueFolder, fit: JointFit, unit: float = 1.0) -> LinkMesh:
     """The moving link at q = 0; it stands in its file as in ``reference_frame`` of ``meshes/frame.npz`` (else frame 0).
+
+    Args:
+        unit: of the file's world in the joint's lengths; a provider's own mesh is in the joint's.
 
     Raises:
         TaaError: there is no such frame.
     """
-    if not folder.path("meshes/frame").is_file():
+    if folder.users(MESHES[1]):
+        link = scaled_link(link, unit) if unit != 1.0 else link
+    if not folder.path("meshes/frame").is_file() or not folder.users(MESHES[1]):
         return link
     frame = folder.read("meshes/frame", "reference_frame")["reference_frame"]
     q = np.asarray(fit.q, float)

@@ -146,6 +146,7 @@ class Seen:
     providers: tuple[ProviderInfo, ...]
     notes: tuple[str, ...]
     focal_given: bool
+    unit: float = 1.0
 
 
 def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None, out: str | Path | None = None,
@@ -281,19 +282,21 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     tracks = stages.run("tracks", follow, ("providers/lk_tracks.py",), given=given.get("tracks"))
     if folder:
         folder.write("tracks", cues_io.track_arrays(tracks))
-    fit, words = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
+    fit, words, unit = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
     if folder and fit.verdict != "refused":
         folder.write("camera", cues_io.camera_arrays(fit, len(stable)))
     makers = dict.fromkeys([hands.provider, tracks.provider])
     if folder:
         makers |= dict.fromkeys(folder.maker(name) for name in ("camera", "depth") if name in given)
-    return Seen(stable, hands, tracks, fit, tuple(makers), (*notes, *words), focal is not None or camera is not None)
+    known = focal is not None or camera is not None
+    return Seen(stable, hands, tracks, fit, tuple(makers), (*notes, *words), known, unit)
 
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,
            folder: cues_io.CueFolder | None, given: Mapping[str, str], seed: int,
-           stages: Stages) -> tuple[JointFit, list[str]]:  # fmt: skip
-    """The joint, metric where a scale is known, in the world of the user's camera where there is one; and notes."""
+           stages: Stages) -> tuple[JointFit, list[str], float]:  # fmt: skip
+    """The joint, metric where a scale is known, in the world of the user's camera where there is one; notes; and the
+    length of that world's unit in the joint's."""
     from reconstruct.depth import depth_scale
     from reconstruct.hand.scale import hand_scale
     from reconstruct.joint.fit import fit_joint
@@ -327,7 +330,8 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         ranged = False
         fit = stages.run("joint", find, ("joint",), options={"focal": focal, "with_depth": None})
     if fit.verdict == "refused":
-        return fit, notes
+        return fit, notes, 1.0
+    plain = fit
 
     def scaled() -> JointFit:
         if folder is not None and "depth" in given and not ranged:
@@ -344,7 +348,9 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         fit = cues_io.in_world_of(fit, camera)
     if words := second_part(video, tracks, fit):
         notes.append(words)
-    return fit, notes
+    # A scene without metres whose joint the hand has scaled: what else it holds, meshes, is scaled alike.
+    lengths = [np.median(np.linalg.norm(f.points, axis=1)) for f in (plain, fit)]
+    return fit, notes, float(lengths[1] / lengths[0]) if ranged else 1.0
 
 
 def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int, seen: Seen,
@@ -381,7 +387,9 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
     def shape() -> Geometry:
         links = cues_io.meshes_from_cue(folder.folder, meshes) if folder and meshes else {}
         if folder and "moving" in links:
-            links["moving"] = cues_io.moving_at_rest(links["moving"], folder, fit)
+            links["moving"] = cues_io.moving_at_rest(links["moving"], folder, fit, seen.unit)
+        if folder and "static" in links and folder.users(cues_io.MESHES[0]):
+            links["static"] = cues_io.scaled_link(links["static"], seen.unit)
         if len(links) == len(cues_io.MESHES):
             built = Geometry(links["static"], links["moving"])
         else:
@@ -479,5 +487,5 @@ def fit_scene(scene: str | Path, focal: float | None = None, seed: int = 0, prog
         nobody = Hands((), np.zeros((len(video), 1, 1), bool), cues_io.GIVEN)
         hands = found if isinstance(found, Hands) and found.mask.shape[0] == len(video) else nobody
     stages = Stages(None, progress or Silent())
-    fit, _ = _joint(video, hands, tracks, focal, camera, folder, given, seed, stages)
+    fit, _, _ = _joint(video, hands, tracks, focal, camera, folder, given, seed, stages)
     return joint_object(fit, video.index)

@@ -324,7 +324,7 @@ def noise_of_rays(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
 
 
 def fuse_meshes(keys: Sequence[KeyMesh], fit: JointFit, masks: LinkMasks, size: tuple[int, int],
-                depth: np.ndarray | None = None) -> Fused:  # fmt: skip
+                depth: np.ndarray | None = None, labels: Sequence[np.ndarray] | None = None) -> Fused:  # fmt: skip
     """One closed mesh a link from one mesh of both links a key frame.
 
     Args:
@@ -333,6 +333,7 @@ def fuse_meshes(keys: Sequence[KeyMesh], fit: JointFit, masks: LinkMasks, size: 
         masks: of both links and the hands.
         size: (width, height) full px, which ``fit.K`` refers to.
         depth: (T, h, w) m, NaN where unknown; None takes the meshes' own scale and place.
+        labels: per key mesh, (F,) bool: the face belongs to the moving link; voted by the masks when None.
 
     Raises:
         TaaError: no mesh meets its depth, or one of the links is in none of them.
@@ -356,11 +357,14 @@ def fuse_meshes(keys: Sequence[KeyMesh], fit: JointFit, masks: LinkMasks, size: 
         raise TaaError("no key frame's mesh meets its depth; check that meshes and depth belong to the same frames")
     frames = [key.frame for key in keys]
     used = np.array(grounded)
-    labels = [np.zeros(SAMPLES, bool)] * len(keys)
+    given, labels = labels, [np.zeros(SAMPLES, bool)] * len(keys)
     residual = np.full(len(keys), np.inf)
     for _ in range(2):
         placed = [cloud.moved(pose) for cloud, pose in zip(clouds, poses, strict=True)]
         for k in range(len(keys)):
+            if given is not None:
+                labels[k] = np.asarray(given[k], bool)[clouds[k].face]
+                continue
             others = [(frames[i], placed[i]) for i in np.flatnonzero(used) if i != k]
             labels[k] = vote(placed[k], frames[k], frames, fit, masks, size, depth, others) > 0.5
         for k in np.flatnonzero(used):
