@@ -356,6 +356,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
 def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int, seen: Seen,
            stages: Stages) -> ReconstructResult:  # fmt: skip
     """The stages from the joint to the asset: masks, geometry, hand, asset, replay, report."""
+    from reconstruct.geometry.collision import keep_clear
     from reconstruct.geometry.links import build_geometry
     from reconstruct.geometry.masks import segment_links
     from reconstruct.hand.align import align_hand
@@ -405,6 +406,7 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
     if "masks" in given and len(meshes) == len(cues_io.MESHES):
         fit, geometry, words = _refine(video, tracks, fit, geometry, masks, stages)
         seen = replace(seen, fit=fit, notes=(*seen.notes, words))
+    geometry = keep_clear(geometry, fit)
     reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
     if folder:
         folder.write("masks", cues_io.mask_arrays(masks))

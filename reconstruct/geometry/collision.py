@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.geometry.solids import hull, sweep_range, to_arrays
+from reconstruct.geometry import Geometry
+from reconstruct.geometry.solids import hull, sweep_range, swept_hulls, to_arrays
 from reconstruct.joint.models import JointFit
 
 Part = tuple[np.ndarray, np.ndarray]
@@ -128,3 +130,26 @@ def contacts_over_range(moving: tuple[Part, ...], static: tuple[Part, ...], fit:
                 count += 1
                 depth = max(depth, -float(c.dist) * size)
     return {"states": states, "contacts": count, "penetration": depth}
+
+
+def keep_clear(geometry: Geometry, fit: JointFit, clearance: float = 0.004) -> Geometry:
+    """The same geometry, its static parts cut back where the moving link would meet them over the joint's range.
+
+    Surfaces stay as they are: a mesh that somebody gave may overlap the other link by what its maker did not know, and
+    only its collision parts decide whether the joint can move.
+
+    Args:
+        clearance: gap to leave, in parts of the moving link's extent.
+    """
+    before = contacts_over_range(geometry.moving.parts, geometry.static.parts, fit)
+    if not before["contacts"]:
+        return geometry
+    extent = float(np.linalg.norm(np.ptp(np.concatenate([v for v, _ in geometry.moving.parts]), axis=0)))
+    parts = trim_parts(geometry.static.parts, swept_hulls(geometry.moving.parts, fit, clearance * extent))
+    after = contacts_over_range(geometry.moving.parts, parts, fit) if parts else {"contacts": 0}
+    lost = len(geometry.static.parts) - len(parts)
+    words = (f"the links overlapped by up to {before['penetration']:.3g} over the joint's range: the static link's "
+             f"collision parts were cut back{f' and {lost} of them left out' if lost else ''}")  # fmt: skip
+    entry = {"value": after["contacts"], "origin": "observed", "before_cutting": before["contacts"]}
+    return replace(geometry, static=replace(geometry.static, parts=parts), notes=(*geometry.notes, words),
+                   provenance={**geometry.provenance, "contacts_over_range": entry})  # fmt: skip

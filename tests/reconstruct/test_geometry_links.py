@@ -9,11 +9,13 @@ import pytest
 import trimesh
 
 from reconstruct.errors import TaaError
-from reconstruct.geometry.collision import contacts_over_range, convex_parts, trim_parts
+from reconstruct.geometry import Geometry, LinkMesh
+from reconstruct.geometry.collision import contacts_over_range, convex_parts, keep_clear, trim_parts
 from reconstruct.geometry.links import build_geometry
 from reconstruct.geometry.masks import segment_links
 from reconstruct.geometry.plane import fit_plane
 from reconstruct.geometry.solids import hull, swept_hulls, to_arrays
+from reconstruct.joint.models import JointFit
 from tests.reconstruct.geometry_scenes import make_scene
 
 
@@ -151,3 +153,19 @@ def test_convex_parts_of_an_angle_iron():
     assert abs(report["volume_error"]) < 0.1
     whole, report = convex_parts(*a)
     assert len(whole) == 1 and abs(report["volume_error"]) < 1e-6
+
+
+def test_a_given_body_in_the_links_way_is_cut_back_and_says_so():
+    fit = JointFit("ok", "", "revolute", {"revolute": 1.0}, np.array([0.0, 0, 1]), np.array([-0.2, -0.02, 0.2]), None,
+                   np.linspace(-1.2, 0.0, 5), np.arange(5), np.eye(3), np.eye(4), np.zeros((3, 3)), np.arange(3), True,
+                   "given", {}, None, 0.5, 3, 3, None)  # fmt: skip
+    # The body reaches 1 cm into the door.
+    door, body = _box([-0.2, -0.05, 0.0], [0.2, -0.02, 0.4]), _box([-0.2, -0.03, 0.0], [0.2, 0.25, 0.4])
+    link = lambda p: LinkMesh(p[0], p[1], np.full((8, 4), 200, np.uint8), np.zeros(12, bool), (p,))  # noqa: E731
+    mended = keep_clear(Geometry(link(body), link(door)), fit)
+    assert contacts_over_range(mended.moving.parts, mended.static.parts, fit)["contacts"] == 0
+    assert mended.notes and "cut back" in mended.notes[0]
+    assert mended.provenance["contacts_over_range"]["before_cutting"] > 0
+    low, high = mended.static.parts[0][0].min(0), mended.static.parts[0][0].max(0)
+    assert (high - low)[1] > 0.2  # most of the body is left
+    assert keep_clear(mended, fit) is mended
