@@ -77,6 +77,8 @@ def number_origins(video: Video, fit: JointFit, geometry: Geometry, focal_given:
     }  # fmt: skip
     if fit.residual_px is not None:
         made["joint.residual_px"] = {"value": fit.residual_px, "unit": "px", "origin": "observed"}
+    if reference is not None and reference.contact.any():
+        made["hand.side"] = {"value": reference.side, "origin": "observed", "note": "which hand demonstrates"}
     units = {"size": "1", "time": "s"}
     for name, std in (reference.std if reference is not None else {}).items():
         made[f"hand.{name}"] = {"value": 0.0, "unit": units.get(name, "m"), "origin": "fitted", "std": std,
