@@ -62,7 +62,8 @@ def draw(rows: list[dict], figure: Path) -> None:
                         ("500 tracks", [r for r in rows if r["tracks"] == 500]),
                         ("both grow", [r for r in rows if r["frames"] > 100 and r["tracks"] > 500])):  # fmt: skip
         some.sort(key=lambda r: r["tracks"] * r["frames"])
-        ax.loglog([r["tracks"] * r["frames"] for r in some], [r["cpu_s"] for r in some], "o-", label=label)
+        if some:
+            ax.loglog([r["tracks"] * r["frames"] for r in some], [r["cpu_s"] for r in some], "o-", label=label)
     x = np.array([min(r["tracks"] * r["frames"] for r in rows), max(r["tracks"] * r["frames"] for r in rows)], float)
     top = max(rows, key=lambda r: r["tracks"] * r["frames"])
     ax.loglog(x, top["cpu_s"] * x / x[1], "k--", lw=1, label="linear")
