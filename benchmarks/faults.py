@@ -433,8 +433,12 @@ class Reconstruct(Job):
             raise RuntimeError("taa reconstruct failed")
 
     def result(self) -> dict:
-        """Everything but the pages, films and seconds."""
-        return digests(self.folder / "assets" / "demo", ("report.html", "film.mp4", "preview.png"))
+        """Everything but the pages, the films and how long it took."""
+        folder = self.folder / "assets" / "demo"
+        made = digests(folder, ("report.html", "film.mp4", "preview.png", "asset.json"))
+        facts = json.loads((folder / "asset.json").read_text())
+        facts["provenance"].pop("seconds", None)
+        return {**made, "asset.json": json.dumps(facts)}
 
     def look(self) -> None:
         from taa_envs.asset import AssetError, load_asset

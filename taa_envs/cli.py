@@ -300,6 +300,20 @@ class Build(Common):
     """Seconds after which a video is given up."""
     again: tuple[Literal["failed", "refused", "done"], ...] = ()
     """States of an earlier run to try again; what was left unfinished goes on in any case."""
+    segment: str | None = None
+    """Provider of the link masks, as for `taa reconstruct`."""
+    depth: str | None = None
+    """Provider of depth."""
+    track: str | None = None
+    """Provider of point tracks."""
+    hand: str | None = None
+    """Provider of hands."""
+    mesh: str | None = None
+    """Provider of link meshes."""
+    labels: str | None = None
+    """Provider of the part labels of whole meshes."""
+    camera: str | None = None
+    """Provider of camera poses."""
     focal: float | None = None
     """Focal length of the upright full-size frame, px, if all videos share one."""
     overwrite: bool = False
@@ -308,8 +322,10 @@ class Build(Common):
     """Seed of everything that draws."""
 
     def run(self) -> Outcome:
+        names = ("segment", "depth", "track", "hand", "mesh", "labels", "camera")
+        chosen = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return commands.build(self.videos, self.out, self.engine, self.workers, self.retries, self.timeout, self.again,
-                              self.focal, self.overwrite, self.seed)  # fmt: skip
+                              chosen, self.focal, self.overwrite, self.seed)  # fmt: skip
 
 
 @dataclass(kw_only=True)

@@ -369,7 +369,8 @@ def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: boo
 
 
 def build(videos: Path, out: Path | None, engine: str, workers: int | None, retries: int, timeout: float,
-          again: tuple[str, ...], focal: float | None, overwrite: bool, seed: int) -> Outcome:  # fmt: skip
+          again: tuple[str, ...], providers: dict[str, str], focal: float | None, overwrite: bool,
+          seed: int) -> Outcome:  # fmt: skip
     from rich.console import Console
     from rich.markup import escape
 
@@ -388,7 +389,8 @@ def build(videos: Path, out: Path | None, engine: str, workers: int | None, retr
         share = f"{ended:>4}/{sum(counts.values())}"
         err.print(f"{share}  {row.state:<8} {escape(row.id)}  {escape(words)}", soft_wrap=True)
 
-    manifest = run(Build(videos, out, engine, workers, retries, timeout, again, {}, focal, seed, overwrite), tell)
+    manifest = run(Build(videos, out, engine, workers, retries, timeout, again, providers, focal, seed,
+                         overwrite), tell)
     counts = manifest.counts()
     rows = [(r.id, r.state, f"{r.seconds:.0f}", r.result or r.error) for r in manifest.rows.values()]
     data = {"out": str(out), "counts": counts, "rows": [vars(r) for r in manifest.rows.values()],

@@ -20,6 +20,10 @@ LAST_CUE = "scale"
 """Stage after which no provider of cues is needed any more, and the second part of a job begins."""
 
 
+CUES = ("depth", "track", "hand", "camera")
+"""Stages of providers that run up to it."""
+
+
 @dataclass
 class Build:
     """What a build is to do.
@@ -128,8 +132,11 @@ class _Run:
         self.plan, self.manifest, self.engine, self.tell = plan, manifest, engine, tell
         self._saved = 0.0
         self._needs = {"": Needs()}
-        if uses_gpu(plan.providers):
-            self._needs = {LAST_CUE: Needs(1.0, plan.gpu, 6 * GB), "": Needs()}
+        cues, rest = (
+            uses_gpu({k: v for k, v in plan.providers.items() if (k in CUES) is early}) for early in (True, False)
+        )
+        if cues or rest:  # a GPU is held only by the half of a job that uses one
+            self._needs = {LAST_CUE: _share(plan.gpu, cues), "": _share(plan.gpu, rest)}
 
     def all(self, todo: list[Row]) -> None:
         first = next(iter(self._needs))
@@ -193,6 +200,10 @@ class _Run:
         if now or len(self.manifest.rows) < 500 or time.monotonic() - self._saved > 2.0:
             self.manifest.save()
             self._saved = time.monotonic()
+
+
+def _share(gpu: float, used: bool) -> Needs:
+    return Needs(1.0, gpu, 6 * GB) if used else Needs()
 
 
 def uses_gpu(providers: Mapping[str, str]) -> bool:

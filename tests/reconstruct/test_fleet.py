@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import os
 import signal
@@ -37,7 +38,7 @@ def attempts(plan: Build, name: str) -> int:
 
 def test_every_video_has_an_end(tmp_path: Path) -> None:
     work = plan(tmp_path, ["a/good.mp4", "poison.mp4", "once.mov", "broken.avi", "odd.mp4", "nothing.mkv", "hang.mp4",
-                           "<b>good.mp4"], seconds=20.0, retries=1)  # fmt: skip
+                           "<b>good.mp4"], seconds=12.0, retries=1)  # fmt: skip
     told: list[str] = []
     rows = {r.video: r for r in build(work, lambda row, counts: told.append(f"{row.id} {row.state}")).rows.values()}
     assert {v: r.state for v, r in rows.items()} == {
@@ -49,7 +50,7 @@ def test_every_video_has_an_end(tmp_path: Path) -> None:
         and rows["once.mov"].attempts == 2
     )
     assert rows["broken.avi"].error == "this video is broken; film another" and attempts(work, "broken.avi") == 1
-    assert "within 20 s" in rows["hang.mp4"].error and "ZeroDivisionError" in rows["odd.mp4"].error
+    assert "within 12 s" in rows["hang.mp4"].error and "ZeroDivisionError" in rows["odd.mp4"].error
     assert all("\n" not in r.error and ("; " in r.error) == (r.state != "done") for r in rows.values())
     for row in rows.values():
         if row.state == "done":
@@ -67,6 +68,27 @@ def test_every_video_has_an_end(tmp_path: Path) -> None:
     build(work)
     assert attempts(work, "a/good.mp4") == before["a/good.mp4"] and attempts(work, "poison.mp4") == before["poison.mp4"]
     assert attempts(work, "nothing.mkv") == before["nothing.mkv"] + 1
+
+
+def test_a_job_in_two_halves_holds_the_gpu_in_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from reconstruct.fleet.engines import Local
+
+    asked: list[tuple[str, str | None, float]] = []
+    submit = Local.submit
+
+    def note(self: Local, job: dict, needs: object) -> None:
+        asked.append((job["id"], job["until"], needs.gpus))
+        submit(self, job, needs)
+
+    monkeypatch.setattr(Local, "submit", note)
+    module = importlib.import_module("reconstruct.fleet.build")  # the package's attribute of that name is the function
+    monkeypatch.setattr(module, "uses_gpu", lambda providers: "depth" in providers)
+    monkeypatch.setattr("reconstruct.providers.table.choose", lambda providers: providers)
+    work = plan(tmp_path, ["good.mp4", "good2.mp4"], providers={"depth": "da3", "segment": "motion"})
+    assert build(work).counts()["done"] == 2
+    assert sorted(asked, key=str) == sorted(
+        [("good", "scale", 0.25), ("good", None, 0.0), ("good2", "scale", 0.25), ("good2", None, 0.0)], key=str
+    )
 
 
 def test_ids_follow_from_paths_alone(tmp_path: Path) -> None:
