@@ -6,7 +6,7 @@
 
 The hidden effects come from the tests' own injector (own integrator, friction law and noise); six logs of 6 s at
 100 Hz a case. A cell is a hidden effect; mechanisms take turns within it. Right is: the exact names for effects,
-`consistent` for nothing, `unexplained` for effects outside the library, `ambiguous` with the true cause listed and
+`consistent` for nothing (of a bent sensor also `unexplained`), `unexplained` for effects outside the library, `ambiguous` with the true cause listed and
 the experiment named where the protocol cannot tell. Failures count as failures; parameter errors and intervals are of
 cases named exactly.
 """
@@ -81,12 +81,13 @@ def run(label: str, names: tuple[str, ...], how: dict, plant: str, seed: int, lo
     if label.startswith("confusable:"):
         _, _, _, rival, words = injector.CONFUSABLE[label.split(":", 1)[1]]
         sets = [said, *(set(a) for a in d["alternatives"])]
-        right = (result.verdict == "ambiguous" and set(names) in sets and {rival} in sets
+        right = (result.verdict == "ambiguous" and set(names) in sets and any(rival in s for s in sets)
                  and words in (d["next_experiment"] or ""))  # fmt: skip
         wrong = result.verdict == "explained" and said != set(names)
     else:
         want = "unexplained" if outside else "explained" if names else "consistent"
         right = result.verdict == want and (outside or said == set(names))
+        right |= how.get("noise") == "distorted" and result.verdict == "unexplained"  # the reading is bent, and said so
         wrong = result.verdict == "explained" and (outside or said != set(names))
     errors, covered = [], []
     if result.verdict == "explained" and said == set(names):

@@ -49,6 +49,12 @@ class Diagnosis:
     partly: bool = True
 
     @property
+    def extends(self) -> bool:
+        """True if the extended model differs from the nominal one."""
+        mechanical = [n for n in self.found.best.causes if CAUSES[n].edit is not None]
+        return self.verdict != "consistent" and self.partly and bool(mechanical)
+
+    @property
     def causes(self) -> tuple[str, ...]:
         """Names of the causes."""
         return tuple(c["name"] for c in self.data["causes"])
@@ -86,7 +92,7 @@ class Diagnosis:
 
 def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = "joint",
              say: Callable[[str], None] = lambda line: None,
-             only: Sequence[str] | None = None) -> Diagnosis:  # fmt: skip
+             only: Sequence[str] | None = None, known: Sequence[str] = ()) -> Diagnosis:  # fmt: skip
     """Say what the model gets wrong about a joint, from measured logs.
 
     Args:
@@ -96,15 +102,12 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
         joint: name of the joint in the model.
         say: called with a line of progress now and then.
         only: names of the causes to consider; None for all.
+        known: what the logs take for granted, in words, for the list of assumptions.
 
     Raises:
         TaaEnvsError: the model or a log cannot be used.
     """
-    path = Path(model)
-    if not path.suffix:
-        from taa_envs.registry import get_asset
-
-        path = get_asset(str(model)).model_path
+    path = model_path(model)
     plant = load_plant(path, joint)
     if only is not None and set(only) - set(CAUSES):
         raise TaaEnvsError(f"no such cause: {', '.join(sorted(set(only) - set(CAUSES)))}; known: {', '.join(CAUSES)}")
@@ -113,7 +116,7 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
     read = [log if isinstance(log, JointLog) else load_log(log) for log in logs]
     for log in read:
         check_units(log, plant.hinge, plant.limits)
-    assumptions = ["the other joints rest where the model puts them, and contacts are off",
+    assumptions = [*known, "the other joints rest where the model puts them, and contacts are off",
                    "each episode's initial position and velocity are fitted, for the nominal model too"]  # fmt: skip
     episodes, names = [], []
     for log in read:
@@ -140,14 +143,23 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
                            "model's own inertia is taken as the measure")  # fmt: skip
     if len(episodes) < 3:
         episodes, names = _cut(plant, episodes, names)
-    held_at = [i for i in range(len(episodes)) if i % 3 == 2]
-    fit_at = [i for i in range(len(episodes)) if i % 3 != 2]
+    held_at = [i for i in range(len(episodes)) if i % 3 == 2] if len(episodes) > 2 else [1]
+    fit_at = [i for i in range(len(episodes)) if i not in held_at]
     fitted = [episodes[i] for i in fit_at]
     motion = Motion.of(plant, fitted)
     problem = Problem(plant, fitted, motion, driven)
     held = problem.on([episodes[i] for i in held_at])
     found = Search(problem, held, say, only).run()
     return _verdict(plant, found, found.fitted, found.held, names, fit_at, held_at, assumptions)
+
+
+def model_path(model: Path | str) -> Path:
+    """The MJCF file of a model that is named by its file or by an asset's id."""
+    if Path(model).suffix:
+        return Path(model)
+    from taa_envs.registry import get_asset
+
+    return get_asset(str(model)).model_path
 
 
 def is_driven(plant: Plant, episodes: list[Episode]) -> bool:
@@ -167,8 +179,8 @@ def _cut(plant: Plant, episodes: list[Episode], names: list[str]) -> tuple[list[
     for e, name in zip(episodes, names, strict=True):
         count = max(3, int(np.ceil(e.t[-1] / WINDOW)))
         pieces = windows(e, count)
-        if len(pieces) < 3 and len(episodes) == 1:
-            raise LogError(f"{name} is too short to hold part of it out; record at least 75 samples or three logs")
+        if len(pieces) < 2 and len(episodes) == 1:
+            raise LogError(f"{name} is too short to hold part of it out; record at least 50 samples or three logs")
         out += pieces
         called += [f"{name}[{p.log.time[0]:.2f}..{p.log.time[-1]:.2f} s]" for p in pieces]
     return out, called

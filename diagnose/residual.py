@@ -39,7 +39,7 @@ def where(plant: Plant, episodes: list[Episode], residuals: list[np.ndarray], un
 def trim_start(plant: Plant, episode: Episode) -> int:
     """How many first samples of a log that claims to be let go cannot be free motion.
 
-    Only where no input is logged at the start and the part moves already there. The acceleration that position and
+    Only where the log's input says let go at its start and the part moves already there. The acceleration that position and
     velocity explain is learned from the rest of the log. While its average over a tenth of a second leaves that by
     more than 6 robust standard deviations from the start on (at most 15 % of the log), the part is still held by
     something that the log does not know.
@@ -47,6 +47,8 @@ def trim_start(plant: Plant, episode: Episode) -> int:
     e = episode
     n = len(e.t)
     most = int(0.15 * n)
+    if e.log.torque is None and e.log.force is None:
+        return 0
     if e.u[: most + 1].any() or abs(e.v[:5].mean()) < 0.1 * np.abs(e.v).max():
         return 0
     shape = [np.sin(e.q), np.cos(e.q)] if plant.hinge else [e.q]

@@ -243,13 +243,31 @@ class Search:
             gap = 0.5 * (f.chi2 - best.fit.chi2 + other.held.chi2 - best.held.chi2)
             if gap < RIVAL and all(f.z(n) > 2 for n in causes):
                 out.append(other)
+        scaled = self._scaled(best.causes)
+        if scaled is not None:
+            other = self._judge(scaled)
+            if 0.5 * (other.fit.chi2 - best.fit.chi2 + other.held.chi2 - best.held.chi2) < RIVAL:
+                out.append(other)
         return sorted(out, key=lambda s: s.score)[:8]
+
+    def _scaled(self, causes: tuple[str, ...]) -> tuple[str, ...] | None:
+        """Without any logged input a larger inertia is the same as all torques smaller: that set, however large."""
+        if "inertia" not in causes or any(e.u.any() for e in self.fitted.episodes):
+            return None
+        p = self.fitted.plant
+        torques = {"gravity_torque": p.hinge and any(p.gravity[:2]), "viscous_damping": p.damping[0] > 0,
+                   "coulomb_friction": p.frictionloss > 0, "spring": p.stiffness > 0}  # fmt: skip
+        names = {*_less(causes, "inertia"), *(n for n, there in torques.items() if there)}
+        return _sorted(n for n in names if not any(n in CAUSES[m].contains for m in names)) if names else None
 
     def _left(self, found: Found) -> None:
         """Is anything left? Slow residual beyond the noise says so, and free torques over q and velocity."""
         best = found.best
         if set(best.causes) & set(UNNAMED):
             found.left = "the position reading itself is bent: its scale changes over the range"
+        if best.causes and best.held.rmse > 2.5 * best.fit.rmse and best.held.rmse > 3 * self.noise.std:
+            found.left = found.left or ("what fits some episodes does not carry over: the held-out error is "
+                                        f"{best.held.rmse / best.fit.rmse:.1f} times that of the fitted ones")
         residuals = best.fit.residuals + best.held.residuals
         _, generous = estimate(residuals, self.smallest)
         found.excess = excess(residuals, generous)

@@ -16,7 +16,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Annotated, Literal
 
@@ -271,15 +271,20 @@ class Diagnose(Common):
     """Id of an asset, or an MJCF file."""
     joint: str = "joint"
     """Name of the joint in the model."""
-    data: list[Path]
+    data: list[Path] = field(default_factory=list)
     """Joint logs, one episode a CSV: time, q, then torque or a hand's force and point."""
+    from_video: bool = False
+    """Use the asset's own video instead: its joint's state over the frames in which no hand touches the part."""
+    revise: bool = False
+    """Of an asset's id: also write the asset's next revision (<id>-r2) beside it, with the extended model."""
     out: Path
     """Folder to write: diagnosis.json, report.html, model_extended.xml."""
     overwrite: bool = False
     """Replace that folder."""
 
     def run(self) -> Outcome:
-        return commands.diagnose(self.model, self.joint, self.data, self.out, self.overwrite)
+        return commands.diagnose(self.model, self.joint, self.data, self.out, self.overwrite, self.from_video,
+                                 self.revise)
 
 
 @dataclass(kw_only=True)

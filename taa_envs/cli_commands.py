@@ -342,12 +342,37 @@ def export(asset_id: str, kind: str, out: Path | None, overwrite: bool) -> Outco
     return Outcome(data, lambda: print(main))
 
 
-def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: bool) -> Outcome:
+def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: bool, from_video: bool = False,
+             revise: bool = False) -> Outcome:  # fmt: skip
     from diagnose import diagnose as run
+    from diagnose.causes import CAUSES
 
     if out.exists() and not overwrite:
         raise TaaEnvsError(f"{out} exists; choose another --out or use --overwrite")
-    result = run(model, data, joint, say=lambda line: print(line, file=sys.stderr))
+    if from_video == bool(data):
+        raise TaaEnvsError("measured data are wanted: give CSV files with --data, or --from-video for an asset's own")
+    logs, known, only, asset = list(data), [], None, None
+    if from_video or revise:
+        from taa_envs.registry import get_asset
+
+        if Path(model).suffix:
+            raise TaaEnvsError(f"{model} is a file; --from-video and --revise need the id of an asset")
+        asset = get_asset(model)
+    if from_video:
+        from diagnose.video import assumptions, video_logs
+
+        logs, known = video_logs(asset), assumptions(asset)
+        only = [name for name in CAUSES if name != "inertia"]  # the measure of all that a video can show
+    result = run(model, logs, joint, say=lambda line: print(line, file=sys.stderr), known=known, only=only)
+    new = None
+    if revise and result.extends:
+        from diagnose.revision import revise as write
+        from taa_envs.replay import replay as play
+
+        new = write(asset, result)
+        result.data["revision"] = {"id": new.id, "path": str(new.path), "replay_progress": {
+            "before": float(play(asset, controls=False).joint_progress),
+            "after": float(play(new, controls=False).joint_progress)}}  # fmt: skip
     with folder_written_whole(out, overwrite) as work:
         result.write(work, final=out)
 
@@ -363,6 +388,11 @@ def diagnose(model: str, joint: str, data: list[Path], out: Path, overwrite: boo
             print(f"measure next: {d['next_experiment']}")
         print(f"held-out error {d['nominal']['heldout_rmse']:.4g} -> {d['extended']['heldout_rmse']:.4g} {d['unit']} "
               f"(noise {d['noise_floor']:.4g})")  # fmt: skip
+        if new is not None:
+            change = d["revision"]["replay_progress"]
+            print(f"new revision {new.id}: replay {change['before']:.0%} -> {change['after']:.0%}  {new.path}")
+        elif revise:
+            print("no new revision: nothing was found that changes the model")
         print(f"report  {out / 'report.html'}")
 
     return Outcome(result.data, words)

@@ -121,6 +121,7 @@ class PointsController:
         self.dof = np.array([[model.joint(f"{n}_{a}").dofadr[0] for a in "xyz"] for n in names])
         self.act = np.array([[model.actuator(f"{n}_{a}").id for a in "xyz"] for n in names])
         self.target = model.actuator_actadr[self.act]
+        self.ctrl = model.actuator_ctrladr[self.act]  # an object's passive actuators have none
         self.lead = hand.damping / hand.stiffness
 
     def place(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> None:
@@ -128,7 +129,7 @@ class PointsController:
         data.qpos[self.qpos] = self.weights @ joints
         data.qvel[self.dof] = 0.0 if velocity is None else self.weights @ velocity
         data.act[self.target] = self.weights @ joints
-        data.ctrl[self.act] = 0.0
+        data.ctrl[self.ctrl] = 0.0
 
     def control(self, data: mujoco.MjData, joints: np.ndarray) -> None:
         """Aim at landmarks (21, 3) m within the limit of the whole hand's force."""
@@ -141,7 +142,7 @@ class PointsController:
         if total > self.hand.total_force:
             target = here + (pull * (self.hand.total_force / total) + drag) / self.hand.stiffness
         data.act[self.target] = target
-        data.ctrl[self.act] = 0.0
+        data.ctrl[self.ctrl] = 0.0
 
     def landmarks(self, data: mujoco.MjData) -> np.ndarray:
         """(21, 3) where the landmarks are, m, asset frame; a copy."""

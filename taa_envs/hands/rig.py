@@ -154,8 +154,9 @@ class JointedController:
         self._v = np.array([int(model.joint(PREFIX + n).dofadr[0]) for n in names[1:]])
         self._mocap = int(model.body(f"{PREFIX}target").mocapid[0])
         own = [alone.actuator(i).name for i in range(alone.nu)]
-        self._ctrl = np.array([model.actuator(PREFIX + n).id for n in own])
-        self._servos = np.array([model.actuator(f"{PREFIX}base_{a}").id for a in ("x", "y", "z", "rx", "ry", "rz")])
+        self._ctrl = model.actuator_ctrladr[[model.actuator(PREFIX + n).id for n in own]]
+        self._servos = model.actuator_ctrladr[[model.actuator(f"{PREFIX}base_{a}").id
+                                               for a in ("x", "y", "z", "rx", "ry", "rz")]]  # fmt: skip
         self._transmission = _transmission(alone)
         self._inverse = np.linalg.pinv(self._transmission)
         self._range = (np.where(alone.actuator_ctrllimited, alone.actuator_ctrlrange[:, 0], -np.inf),
