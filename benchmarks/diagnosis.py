@@ -6,7 +6,8 @@
 
 The hidden effects come from the tests' own injector (own integrator, friction law and noise); six logs of 6 s at
 100 Hz a case. A cell is a hidden effect; mechanisms take turns within it. Right is: the exact names for effects,
-`consistent` for nothing (of a bent sensor also `unexplained`), `unexplained` for effects outside the library, `ambiguous` with the true cause listed and
+`consistent` for nothing (of a bent sensor also `unexplained`), `unexplained` for effects outside the library,
+`ambiguous` with the true cause listed and
 the experiment named where the protocol cannot tell. Failures count as failures; parameter errors and intervals are of
 cases named exactly.
 """

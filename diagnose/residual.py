@@ -39,7 +39,8 @@ def where(plant: Plant, episodes: list[Episode], residuals: list[np.ndarray], un
 def trim_start(plant: Plant, episode: Episode) -> int:
     """How many first samples of a log that claims to be let go cannot be free motion.
 
-    Only where the log's input says let go at its start and the part moves already there. The acceleration that position and
+    Only where the log's input says let go at its start and the part moves already there.
+    The acceleration that position and
     velocity explain is learned from the rest of the log. While its average over a tenth of a second leaves that by
     more than 6 robust standard deviations from the start on (at most 15 % of the log), the part is still held by
     something that the log does not know.
