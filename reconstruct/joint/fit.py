@@ -8,18 +8,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
+from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.evidence import free_motion, type_probability
-from reconstruct.joint.focal import DEFAULT_FOCAL, estimate_focal
+from reconstruct.joint.finish import Finished, finish
 from reconstruct.joint.models import JointFit
+from reconstruct.joint.polish import positions, residuals
 from reconstruct.joint.select import explained, key_frames, motion_stretches, observations, search
-from reconstruct.joint.uncertainty import joint_std
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 
 MOVING_SHARE = 0.012
 """A track moves if its extent exceeds this share of the image diagonal."""
 MIN_INLIERS = 8
+DEFAULT_FOCAL = 0.8
+"""Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
+PRIOR_STD = 0.12
+"""Prior standard deviation of its logarithm."""
+KNOWN_STD = 0.02
+"""Standard deviation that is stated for a focal length that was given."""
 FREE_SHARE = 1 / 3
 """A joint is refuted if this share of the points that move most follow a free rigid body but not the joint. Real hinges
 and slides, with flexing parts, drifting tracks and an imperfect camera, stay under a fifth; a lid that is lifted away
@@ -50,7 +56,7 @@ def fit_joint(
     uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
     h, w = video.frames.shape[1:3]
     known = focal_px or video.focal_px
-    full, focal_std = known or DEFAULT_FOCAL * max(video.size), 0.02
+    full = known or DEFAULT_FOCAL * max(video.size)
     camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
     found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
@@ -70,20 +76,9 @@ def fit_joint(
                         type_probability=found.probability)  # fmt: skip
     tell(0.9)
 
-    # Directions that the data hardly hold (an axis towards the camera) converge slowly: finish on the link alone.
-    s, own = found.state, found.link
-    if not known:
-        factor, focal_std = estimate_focal(s, own)
-        full, camera = full * factor, replace(camera, focal=camera.focal * factor)
-        own = replace(own, xy=own.xy / factor, px=own.px / factor)
-    s = refine(s, own, scales=(4.0, 2.0), iterations=60)
-    T = len(video)
-    dense = _all_frames(uv[found.members], camera, own, T)
-    s = replace(s, q=np.interp(np.arange(T), own.frames, s.q))
-    s = refine(replace(s, depth=_redepth(s, dense).depth), dense, scales=(2.0,), iterations=6, smooth=0.3)
-    std = joint_std(s, dense, focal_std) | {"focal_px": focal_std * full}
+    done = finish(found.starts, uv - camera.centre, found.members, camera.focal, 0.0 if known else PRIOR_STD)
     tell(1.0)
-    return _result(video, s, dense, found.members, full, found.probability, std, len(uv), note)
+    return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
 
 
 @dataclass(frozen=True)
@@ -100,14 +95,13 @@ class _Consensus:
     """The best joint of both types and the tracks that follow it, or why there is none.
 
     Attributes:
-        state: with depths of `link`.  link: key-frame observations of the tracks that follow it.
+        starts: per type, a state with depths of the following tracks, and their key-frame observations.
         members: (n,) indices of these tracks.  probability: of the types.
         explained: motion of all tracks that it explains.
         refusal: a sentence, or "".  scattered: True if too few tracks agree on anything.
     """
 
-    state: State | None = None
-    link: Observations | None = None
+    starts: dict[str, tuple[State, Observations]] = field(default_factory=dict)
     members: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     probability: dict[str, float] = field(default_factory=dict)
     explained: float = 0.0
@@ -151,7 +145,9 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
     few = follows.sum() < MIN_INLIERS
     link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
                         every.frames)  # fmt: skip
-    return _Consensus(replace(s, depth=s.depth[follows]), link, moving[ids[follows]], probability, total,
+    starts = {kind: (_redepth(b, link), link) for kind, b in best.items()}
+    starts[s.kind] = (replace(s, depth=s.depth[follows]), link)
+    return _Consensus(starts, moving[ids[follows]], probability, total,
                       _why_refused(s, every, follows) or "", bool(few))  # fmt: skip
 
 
@@ -180,85 +176,62 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     return None
 
 
-def _all_frames(uv: np.ndarray, camera: _Camera, keyed: Observations, T: int) -> Observations:
-    """Observations of the link's tracks (n, T, 2) in every frame, with the reference frames of the keyed ones."""
-    seen = np.isfinite(uv[..., 0])
-    xy = np.where(seen[..., None], (uv - camera.centre) / camera.focal, 0.0)
-    return Observations(xy, seen, keyed.frames[keyed.ref], keyed.weight, 1.0 / camera.focal, np.arange(T))
-
-
 def _result(
-    video: Video,
-    s: State,
-    obs: Observations,
-    members: np.ndarray,
-    full_focal: float,
-    probability: dict[str, float],
-    std: dict,
-    tracks: int,
-    note: str,
+    video: Video, done: Finished, full_focal: float, tracks: int, note: str, focal_std: float | None
 ) -> JointFit:
     """World frame, signs, units and the contract's fields."""
-    X, _ = transport(s, obs)
-    r = np.linalg.norm(np.where(obs.seen[..., None], reprojection(X, obs), np.nan), axis=-1)
-    rays = obs.ref_rays
-    # Points at q = 0: pull every track's own reference back.
-    zero = replace(s, q=np.concatenate([s.q, [0.0]]))
-    extra = replace(
-        obs,
-        xy=np.concatenate([obs.xy, np.zeros((len(rays), 1, 2))], axis=1),
-        seen=np.concatenate([obs.seen, np.zeros((len(rays), 1), bool)], axis=1),
-        frames=np.arange(len(s.q) + 1),
-    )
-    points = transport(zero, extra)[0][:, -1]
-    unit = float(np.median(X[..., 2][obs.seen]))
-    q, axis = s.q.copy(), s.axis.copy()
+    b, sight, probability = done.bundle, done.sight, done.probability
+    world, cam = positions(b, sight)
+    seen = sight.seen
+    r = np.linalg.norm(residuals(b, sight, cam), axis=-1)[seen]
+    unit = float(np.median(cam[..., 2][seen]))
+    full_focal *= float(np.exp(b.log_focal))
+    turns = b.kind != "prismatic"
+    rate = float(np.linalg.norm(b.twist.curvature)) if turns else 1.0 / unit
+    q, axis = b.q * rate, b.twist.axis
     far = int(np.argmax(np.abs(q)))
     if q[far] < 0:
         q, axis = -q, -axis
-    points = points / unit
-    pivot = None
-    if s.kind == "prismatic":
-        q = q / unit
-        origin = np.median(points, axis=0)
-    else:
-        c = s.point / unit
-        pivot = c + axis * float(np.median((points - c) @ axis))
-        origin = pivot
-    moved = X[:, far] / unit
-    up, how = assumed_up(s.kind, axis, points, moved)
+    points = b.X / unit
+    pivot, origin = None, np.median(points, axis=0)
+    if turns:
+        c = b.twist.point / unit
+        pivot = origin = c + axis * float(np.median((points - c) @ axis))
+    moved = world[:, far] / unit
+    up, how = assumed_up(b.kind, axis, points, moved)
     T_world_camera = world_from_camera(up, axis, origin)
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     K = np.array([[full_focal, 0, (video.size[0] - 1) / 2], [0, full_focal, (video.size[1] - 1) / 2], [0, 0, 1.0]])
     p = max(probability.values())
-    verdict, reason = "ok", f"{len(members)} tracks agree; {how}{note}"
+    verdict, reason = "ok", f"{len(done.members)} tracks agree; {how}{note}"
     if p < 0.9:
         verdict = "ambiguous"
         names = " and ".join(sorted(probability, key=probability.get, reverse=True))
         reason = (
             f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}{note}"
         )
-    std = dict(std, point_m=std["point"] / unit, q=std["q"] / (unit if s.kind == "prismatic" else 1.0))
-    std.pop("point")
+    sure = done.spread
+    std = {"axis_deg": sure.axis_deg, "point_m": sure.point, "q": sure.q,
+           "focal_px": full_focal * (sure.log_focal if focal_std is None else focal_std)}  # fmt: skip
     fit = JointFit(
         verdict,
         reason,
-        s.kind,
+        b.kind,
         probability,
         R @ axis,
         None if pivot is None else R @ pivot + t,
-        None,
+        b.twist.pitch / unit if b.kind == "screw" else None,
         q,
         video.index,
         K,
         np.linalg.inv(T_world_camera),
         points @ R.T + t,
-        members,
+        done.members,
         False,
         "none",
         std,
-        residual_px=float(np.nanmedian(r)) / video.scale,
-        inliers=len(members),
+        residual_px=float(np.median(r)) / video.scale,
+        inliers=len(done.members),
         tracks=tracks,
         moving_frames=_moving_frames(q, video.time),
     )

@@ -109,7 +109,7 @@ def coherence(uv: np.ndarray) -> np.ndarray:
     return np.clip(2 * extent / np.maximum(path, 1e-6), 0, 1) ** 2
 
 
-def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int = 10) -> list[Hypothesis]:
+def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int = 6) -> list[Hypothesis]:
     """Hypotheses from windows around several reference key frames, both directions of time."""
     K = len(obs.frames)
     found: list[Hypothesis] = _global_hypotheses(obs, rng)
@@ -173,7 +173,7 @@ def _global_hypotheses(obs: Observations, rng: np.random.Generator, rounds: int 
     return out
 
 
-def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator) -> list[Hypothesis]:
+def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator, most: int = 70) -> list[Hypothesis]:
     at_ref = obs.seen[:, keys[0]]
     # Tracks seen at the reference and in most of the window; the window ends where too few are left.
     for end in range(len(keys), 4, -3):
@@ -184,8 +184,8 @@ def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator) -
     else:
         return []
     ids = np.flatnonzero(long)
-    if len(ids) > 70:
-        ids = np.sort(rng.choice(ids, 70, replace=False, p=obs.weight[ids] / obs.weight[ids].sum()))
+    if len(ids) > most:
+        ids = np.sort(rng.choice(ids, most, replace=False, p=obs.weight[ids] / obs.weight[ids].sum()))
     if len(k) > 9:
         k = k[np.unique(np.linspace(0, len(k) - 1, 9).round().astype(int))]
     rays = np.concatenate([obs.xy[ids][:, k], np.ones((len(ids), len(k), 1))], axis=-1)
@@ -313,16 +313,51 @@ def explained_by(
     return (amount - left) / np.maximum(amount, 1.0), amount
 
 
+CLEAR_SHARE, CLEAR_PX = 0.4, 1.2
+"""A joint that explains this share of all motion in the picture, with residuals as small as this (working px), needs no
+wider search."""
+
+
 def search(
     obs: Observations,
     rng: np.random.Generator,
-    coarse: int = 60,
+    coarse: int = 40,
     fine: int = 10,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[State]:
-    """Best joints of both types, best first."""
-    hyps = window_hypotheses(obs, rng)
-    progress(0.4)
+    """Best joints of both types, best first.
+
+    A short search comes first: long windows from both ends and the middle. Where one of its joints explains most of
+    the motion in the picture down to the tracks' noise, the answer is clear; else every window is tried.
+    """
+    K = len(obs.frames)
+    few = _global_hypotheses(obs, rng, rounds=1)
+    for span in (np.arange(K), np.arange(K)[::-1], np.arange(K // 2, K), np.arange(K // 2, -1, -1)):
+        few += _one_window(obs, span, rng, most=40)
+    first = _best_of(few, obs, coarse // 4, max(fine // 3, 2), thorough=False)
+    progress(0.2)
+    if first and _is_clear(first[0], obs):
+        return first
+    hyps = few + window_hypotheses(obs, rng)
+    progress(0.5)
+    out = first + _best_of(hyps, obs, coarse, fine, thorough=True)
+    progress(1.0)
+    return sorted(out, key=lambda s: -explained(s, obs)[0])
+
+
+def _is_clear(s: State, obs: Observations) -> bool:
+    total, share = explained(s, obs)
+    _, amount = explained_by(np.zeros(obs.seen.shape), obs, obs.seen)
+    whole = float(np.sum(obs.weight * np.sqrt(amount)))
+    link = share > 0.5
+    if link.sum() < 12 or total < CLEAR_SHARE * whole:
+        return False
+    r = np.linalg.norm(reprojection(transport(s, obs)[0], obs), axis=-1)
+    return bool(np.median(r[link][obs.seen[link]]) < CLEAR_PX)
+
+
+def _best_of(hyps: list[Hypothesis], obs: Observations, coarse: int, fine: int, thorough: bool) -> list[State]:
+    """Hypotheses carried to all key frames, refined and judged on all tracks; best first."""
     out: list[State] = []
     for kind in ("revolute", "prismatic"):
         pool = sorted((h for h in hyps if h.kind == kind), key=lambda h: -h.score)[:coarse]
@@ -332,11 +367,14 @@ def search(
         fined.sort(key=lambda s: -explained(s, obs)[0])
         last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
         if kind == "revolute":
-            last += [refine(_tilted_back(s, obs), obs, scales=(4.0, 2.0), iterations=20) for s in last[:2]]
-        for s in sorted(last, key=lambda s: -explained(s, obs)[0])[:2]:
-            last += [refine(r, obs, scales=(10.0, 5.0, 3.0, 2.0), iterations=12) for r in _states_anew(s, obs)]
+            last += [
+                refine(_tilted_back(s, obs), obs, scales=(4.0, 2.0), iterations=20)
+                for s in last[: 2 if thorough else 1]
+            ]
+        if thorough:
+            for s in sorted(last, key=lambda s: -explained(s, obs)[0])[:2]:
+                last += [refine(r, obs, scales=(10.0, 5.0, 3.0, 2.0), iterations=12) for r in _states_anew(s, obs)]
         out += last
-        progress(0.8 if kind == "revolute" else 1.0)
     return sorted(out, key=lambda s: -explained(s, obs)[0])
 
 

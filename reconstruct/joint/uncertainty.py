@@ -1,59 +1,171 @@
-"""Standard deviations of axis, pivot and states from the robust fit's curvature."""
+"""Covariance of a polished joint: robust against errors that last in time and are shared by neighbours.
+
+White noise would give the inverse of the Schur complement. Real track errors drift and are alike on neighbouring
+points, so that the scores are summed over clusters of tracks first (the cluster-robust sandwich of Liang and Zeger,
+1986); of both answers the larger variance is stated.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruct.joint.bundle import (
-    Observations,
-    State,
+from reconstruct.joint.polish import (
+    ROBUST_SIGMAS,
+    Bundle,
+    Sightings,
     normal_equations,
-    refine,
-    reprojection,
-    robust_cost,
-    transport,
+    positions,
+    residuals,
+    robust_loss,
 )
 
-TEMPORAL_CORRELATION = 10.0
-"""Frames over which a track's error stays the same (drift): that many observations count as one."""
+CELL = 0.06
+"""Edge of a cluster over the link's diagonal."""
 
 
-def joint_std(s: State, obs: Observations, focal_std: float, scale: float = 2.0) -> dict:
-    """Spread of the estimate: curvature of the robust cost plus what a wrong focal length would do.
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations and covariances.
 
-    Returns:
-        {"axis_deg", "point" (distance across the axis, in the state's units), "q": (T,)}.
+    Attributes:
+        axis_deg: of the axis direction.  point: of the axis line across itself, in units of the link's mean depth.
+        q: (T,) of the states, rad or units of the mean depth.
+        curvature: (3, 3) of the twist's curvature.  log_focal: of the focal length's logarithm.
+        inflation: of the axis' variance over that of white noise.
     """
-    X, D = transport(s, obs)
-    r = reprojection(X, obs)
-    _, w = robust_cost(r, obs, scale)
-    H, _, Hll, Hgl, _ = normal_equations(s, obs, X, D, r, w)
-    S = H - (Hgl / (Hll + 1e-12)) @ Hgl.T
-    K = len(s.q)
-    G = len(S) - K
-    noise2 = float(np.sum(w * np.sum(r**2, axis=-1)) / (2 * w.sum() + 1e-12)) * TEMPORAL_CORRELATION
-    # q[0] is the gauge; the smoothness prior keeps states that nothing observes finite.
-    S[G, G] += 1e6 * np.trace(S) / len(S)
-    if not (w > 0).any():
-        return {"axis_deg": 90.0, "point": 1.0, "q": np.full(K, np.ptp(s.q))}
-    damped = S + 1e-9 * np.trace(S) / len(S) * np.eye(len(S))
-    cov = np.linalg.pinv(damped, hermitian=True) * noise2 * np.median(w[w > 0])
-    axis_var = float(np.trace(cov[:2, :2]))
-    point_var = float(cov[2, 2]) if G > 2 else 0.0
-    q_var = np.clip(np.diag(cov)[G:], 0, np.ptp(s.q) ** 2)
-    if focal_std > 0:
-        axes, points, ranges = [], [], []
-        for f in (1 - focal_std, 1 + focal_std):
-            other = replace(obs, xy=obs.xy / f, px=obs.px / f)
-            o = refine(s, other, scales=(scale,), iterations=4)
-            axes.append(o.axis)
-            points.append(o.point)
-            ranges.append(np.ptp(o.q))
-        axis_var += float(np.mean([2 * (1 - min(1.0, abs(a @ s.axis))) for a in axes]))
-        if s.kind != "prismatic":
-            point_var += float(np.mean([np.sum((p - s.point) ** 2) for p in points]))
-        share = np.mean([(g / max(np.ptp(s.q), 1e-9) - 1) ** 2 for g in ranges])
-        q_var = q_var + share * (s.q - s.q[0]) ** 2
-    return {"axis_deg": float(np.degrees(np.sqrt(axis_var))), "point": float(np.sqrt(point_var)), "q": np.sqrt(q_var)}
+
+    axis_deg: float
+    point: float
+    q: np.ndarray
+    curvature: np.ndarray
+    log_focal: float
+    inflation: float
+
+
+def clusters(b: Bundle, cell: float = CELL) -> np.ndarray:
+    """(N,) cluster number of each track: cells of space on the link."""
+    size = np.linalg.norm(np.quantile(b.X, 0.9, axis=0) - np.quantile(b.X, 0.1, axis=0))
+    key = np.floor((b.X - np.median(b.X, axis=0)) / max(cell * size, 1e-9)).astype(int)
+    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+
+
+def shared_error(r: np.ndarray, seen: np.ndarray, cluster: np.ndarray) -> float:
+    """Intraclass correlation of the residuals (N, T, 2) within clusters, in [0, 1]."""
+    count = cluster.max() + 1
+    total = np.zeros((count, *r.shape[1:]))
+    np.add.at(total, cluster, r)
+    square, members = np.zeros((count, r.shape[1])), np.zeros((count, r.shape[1]))
+    r2 = np.sum(r**2, axis=-1)
+    np.add.at(square, cluster, r2)
+    np.add.at(members, cluster, seen.astype(float))
+    pairs = np.sum(total**2, axis=-1) - square
+    norm = np.sum((np.maximum(members, 1) - 1) * square)
+    return float(np.clip(pairs.sum() / norm, 0, 1)) if norm > 0 else 0.0
+
+
+def lasting_error(r: np.ndarray, seen: np.ndarray, most: int = 40) -> float:
+    """Integrated autocorrelation time of the residuals (N, T, 2), frames; 1 for white noise.
+
+    The sum of the autocorrelations up to the first that is not positive (Geyer's initial sequence, 1992).
+    """
+    total, norm = 1.0, np.sum(r**2) / max(seen.sum(), 1)
+    for k in range(1, min(most, r.shape[1] // 2)):
+        both = seen[:, k:] & seen[:, :-k]
+        if both.sum() < 50:
+            break
+        c = np.sum(r[:, k:] * r[:, :-k]) / both.sum() / max(norm, 1e-12)
+        if c < 0.02:
+            break
+        total += 2 * c
+    return float(total)
+
+
+def shared_weights(rho: float, cluster: np.ndarray) -> np.ndarray:
+    """(N,) weights of tracks whose errors correlate by rho within a cluster: 1 / (1 + rho (m - 1)) (Kish, 1965)."""
+    m = np.bincount(cluster)[cluster]
+    return 1.0 / (1.0 + rho * (m - 1))
+
+
+def spread(b: Bundle, s: Sightings) -> Spread:
+    """Covariances at the optimum."""
+    world, cam = positions(b, s)
+    r = residuals(b, s, cam)
+    _, w = robust_loss(r, s, ROBUST_SIGMAS * max(b.sigma, 0.05))
+    n = normal_equations(b, s, world, cam, r, w)
+    T = s.seen.shape[1]
+    A = len(n.H) - T
+    G = n.Z.shape[1]
+    tw = b.twist
+    S, _, inv = n.reduced(0.0)
+    if s.focal_std > 0:
+        S[G, G] += b.sigma**2 * s.lasting / s.focal_std**2
+    # Gauges: q[0], and with one static camera the scale about its centre.
+    S[A, A] += 1e8 * np.trace(S) / len(S)
+    v0 = tw.direction - np.cross(tw.curvature, tw.anchor)
+    if s.R is None:
+        rate = tw.direction @ v0
+        null = np.zeros(len(S))
+        null[:G] = n.Z.T @ np.concatenate([v0 - tw.direction * rate, -tw.curvature * rate])
+        null[A:] = b.q * rate
+        null /= np.linalg.norm(null)
+        S = S + np.trace(S) * np.outer(null, null)
+    B = np.linalg.inv(S + 1e-12 * np.trace(S) / len(S) * np.eye(len(S)))
+    scores = n.scores - np.einsum("pni,nij,nj->np", n.C, inv, n.gp)
+    cluster = clusters(b)
+    groups = np.zeros((cluster.max() + 1, len(S)))
+    np.add.at(groups, cluster, scores)
+    used = max(len(groups) - 1, 1)
+    half = groups @ B.T * np.sqrt(len(groups) / used)  # sandwich = half' half
+    freedom = max(1.0 - (3 * len(b.X) + len(S)) / max(2 * s.seen.sum(), 1), 0.1)
+    white = b.sigma**2 * s.lasting
+
+    def variance(L: np.ndarray) -> np.ndarray:
+        """(k, P) functionals -> (k,) variances."""
+        plain = white * np.einsum("kp,pq,kq->k", L, B, L)
+        return np.maximum(plain, np.sum((half @ L.T) ** 2, axis=0) / freedom)
+
+    by_d, by_w = np.zeros((3, len(S))), np.zeros((3, len(S)))
+    by_d[:, :G], by_w[:, :G] = n.Z[:3], n.Z[3:]
+    # Mean depth of the link's points, the unit of length.
+    unit = float(b.X[:, 2].mean())
+    by_unit = -np.einsum("nj,pnj->p", inv[:, 2], n.C) / len(b.X)
+    own = white * float(inv[:, 2, 2].sum()) / len(b.X) ** 2
+    by_q = np.zeros((T, len(S)))
+    by_q[np.arange(T), A + np.arange(T)] = 1.0
+    if s.R is not None:
+        by_unit, own = np.zeros_like(by_unit), 0.0
+    if b.kind == "prismatic":
+        axis = by_d
+        point = 0.0
+        q = (by_q - np.outer(b.q, by_unit) / unit) / unit
+        q_var = variance(q) + own * (b.q / unit**2) ** 2
+    else:
+        k = np.linalg.norm(tw.curvature)
+        a = tw.axis
+        axis = (np.eye(3) - np.outer(a, a)) @ by_w / k
+        moment = np.cross(tw.curvature, tw.direction)
+        turned = np.cross(by_w.T, tw.direction).T + np.cross(tw.curvature, by_d.T).T
+        c = tw.point
+        by_c = turned / k**2 - 2 * np.outer(moment, tw.curvature @ by_w) / k**4
+        # The line nearest to the link's middle, across itself: the axis turns about the anchor's foot.
+        by_c = (np.eye(3) - np.outer(a, a)) @ (by_c - np.outer(c, by_unit) / unit) / unit
+        point = float(np.sqrt(variance(by_c).sum() + own * (np.sum(c**2) - (c @ a) ** 2) / unit**4))
+        q_var = variance(k * by_q + np.outer(b.q, a @ by_w))
+    axis_var = variance(axis)
+    plain = b.sigma**2 * np.einsum("kp,pq,kq->k", axis, B, axis).sum()
+    curvature = by_w @ B @ by_w.T * white
+    robust = (half @ by_w.T).T @ (half @ by_w.T) / freedom
+    if np.trace(robust) > np.trace(curvature):
+        curvature = robust
+    focal = float(np.sqrt(variance(np.eye(len(S))[G : G + 1])[0])) if s.focal_std > 0 else 0.0
+    q_std = np.sqrt(np.minimum(q_var, _widest(b) ** 2))
+    q_std[0] = 0.0
+    inflation = float(axis_var.sum() / max(plain, 1e-30))
+    return Spread(float(np.degrees(np.sqrt(axis_var.sum()))), point, q_std, curvature, focal, inflation)
+
+
+def _widest(b: Bundle) -> float:
+    span = max(np.ptp(b.q), 1e-9)
+    return span if b.kind == "prismatic" else span * float(np.linalg.norm(b.twist.curvature))

@@ -1,0 +1,225 @@
+"""From the best guesses of the search to the answer: bundle adjustment of every type on all tracks and frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reconstruct.joint.bundle import Observations, State, transport
+from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities
+from reconstruct.joint.polish import (
+    ROBUST_SIGMAS,
+    Bundle,
+    Sightings,
+    place_points,
+    polish,
+    residuals,
+    robust_loss,
+)
+from reconstruct.joint.twist import Twist, twist_of_joint
+from reconstruct.joint.uncertainty import Spread, clusters, lasting_error, shared_error, shared_weights, spread
+
+MIN_COMMON = 8
+FLEX_PX = 1.0
+"""How far real parts flex and tracks drift together, working px, once errors are seen to be shared at all."""
+MOST_FRAMES, MOST_TRACKS = 220, 400
+"""Bounds of one bundle adjustment; further frames get their state afterwards, further tracks their point."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The answer.
+
+    Attributes:
+        bundle: the most probable type's, over all frames, mean depth of the link 1.
+        sight: its observations, (n, T).  members: (n,) indices into the tracks given.
+        spread: its uncertainty.  probability: of each type.
+        rho: correlation of neighbouring tracks' errors.
+        lasting: frames for which a track's error lasts.
+    """
+
+    bundle: Bundle
+    sight: Sightings
+    members: np.ndarray
+    spread: Spread
+    probability: dict[str, float]
+    rho: float
+    lasting: float
+
+
+def bundle_of_state(s: State, obs: Observations, uv: np.ndarray, frames: np.ndarray) -> Bundle:
+    """A key-frame state as a start for all frames, with the link's median depth as the unit.
+
+    Args:
+        s, obs: of the search.  uv: (n, T, 2) of the same tracks, in frames (T,).
+    """
+    rays = obs.ref_rays
+    zero = replace(
+        obs,
+        xy=np.concatenate([obs.xy, np.zeros((len(rays), 1, 2))], axis=1),
+        seen=np.concatenate([obs.seen, np.zeros((len(rays), 1), bool)], axis=1),
+    )
+    q = np.interp(frames, obs.frames, s.q)
+    X = transport(replace(s, q=np.concatenate([s.q, q[:1]])), zero)[0][:, -1]
+    unit = max(float(np.median(X[:, 2])), 1e-6)
+    X, q = X / unit, q - q[0]
+    if s.kind == "prismatic":
+        q = q / unit
+    point = s.point / unit
+    twist, speed = twist_of_joint(s.kind, s.axis, point, _anchor(s.kind, X, s.axis, point))
+    return Bundle(s.kind, twist, q * speed, X)
+
+
+def _anchor(kind: str, X: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The link's middle, or beside it where the axis goes through the middle (a knob)."""
+    middle = np.median(X, axis=0)
+    if kind == "prismatic":
+        return middle
+    across = (X - point) - np.outer((X - point) @ axis, axis)
+    radius = float(np.sqrt(np.median(np.sum(across**2, axis=1))))
+    out = np.median(across, axis=0)
+    if np.linalg.norm(out) < 0.3 * radius:
+        far = across[np.argmax(np.linalg.norm(across, axis=1))]
+        return middle - out + far * radius / np.linalg.norm(far)
+    return middle
+
+
+def finish(starts: dict[str, tuple[State, Observations]], uv: np.ndarray, ids: np.ndarray, focal: float,
+           focal_std: float) -> Finished:  # fmt: skip
+    """Polish every type on the same tracks and decide between them.
+
+    Args:
+        starts: per type, a state with depths of the tracks `ids` and their key-frame observations.
+        uv: (N, T, 2) px from the principal point, NaN where not seen.
+        ids: (n,) tracks that the answer is fitted to.
+        focal: px.  focal_std: of its logarithm, 0 where it is known.
+    """
+    T = uv.shape[1]
+    some = np.arange(T)
+    if T > MOST_FRAMES:
+        keys = next(iter(starts.values()))[1].frames
+        some = np.unique(np.concatenate([keys, np.linspace(0, T - 1, MOST_FRAMES).round().astype(int)]))
+    pick = np.arange(len(ids))
+    if len(ids) > MOST_TRACKS:
+        pick = np.linspace(0, len(ids) - 1, MOST_TRACKS).round().astype(int)
+    sight = sightings(uv[ids[pick]][:, some], focal, focal_std, some)
+    best: dict[str, Bundle] = {}
+    for kind, (state, obs) in starts.items():
+        b = bundle_of_state(state, obs, uv[ids], some)
+        best[kind] = polish(replace(b, X=b.X[pick]), sight)
+    # Tracks that make sense as points of one link, by every type if these are most of them.
+    sane = [compact(b.X) & (b.X[:, 2] > 0) for b in best.values()]
+    keep = np.logical_and.reduce(sane)
+    if keep.sum() < max(MIN_COMMON, 0.5 * len(keep)):
+        keep = sane[int(np.argmin([b.cost for b in best.values()]))]
+    pick = pick[keep]
+    sight = replace(sight, uv=sight.uv[keep], seen=sight.seen[keep], weight=sight.weight[keep])
+    best = {kind: polish(replace(b, X=b.X[keep]), sight) for kind, b in best.items()}
+    lead = min(best.values(), key=lambda b: b.cost)
+    r = residuals(lead, sight)
+    # Gross outliers are not the noise.
+    r = np.where((np.sum(r**2, axis=-1) < (4 * max(lead.sigma, 0.05)) ** 2)[..., None], r, 0.0)
+    rho, lasting = shared_error(r, sight.seen, clusters(lead)), lasting_error(r, sight.seen)
+    # Errors that neighbours share are no noise: they stay for as long as the tracks do.
+    alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / max(lead.sigma, 0.05) ** 2
+    lasting = max(lasting, alike)
+    sight = replace(sight, weight=shared_weights(rho, clusters(lead)), lasting=lasting)
+    for kind, b in _across_kinds(best).items():
+        best[kind] = min((polish(b, sight) for b in b), key=lambda b: b.cost)
+    probability = type_probabilities(best, sight)
+    kind = max(probability, key=lambda k: probability[k])
+    b, every = best[kind], sightings(uv[ids], focal, focal_std, np.arange(T))
+    every = replace(every, weight=np.ones(len(ids)))
+    if len(some) < T:
+        own = replace(every, weight=every.weight[pick], uv=every.uv[pick], seen=every.seen[pick])
+        b = states_of_all_frames(b, own, some)
+    if len(pick) < len(ids):
+        X = np.tile(np.median(b.X, axis=0), (len(ids), 1))
+        X[pick] = b.X
+        b = place_points(replace(b, X=X), every)
+        near = np.isin(np.arange(len(ids)), pick) | compact(b.X)
+        ids, b = ids[near], replace(b, X=b.X[near])
+        every = replace(every, uv=every.uv[near], seen=every.seen[near], weight=every.weight[near])
+    sure = spread(best[kind], sight)
+    if len(some) < T:
+        sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
+    every = replace(every, weight=shared_weights(rho, clusters(b)), lasting=lasting)
+    return Finished(b, every, ids, sure, probability, rho, lasting)
+
+
+def sightings(uv: np.ndarray, focal: float, focal_std: float, frames: np.ndarray) -> Sightings:
+    seen = np.isfinite(uv[..., 0])
+    return Sightings(np.where(seen[..., None], uv, 0.0), seen, np.ones(len(uv)), focal, focal_std, frames=frames)
+
+
+def _across_kinds(best: dict[str, Bundle]) -> dict[str, list[Bundle]]:
+    """Starts of every type from what is known of the others: a slide from a hinge's chord, hinges from a bent slide."""
+    out: dict[str, list[Bundle]] = {k: [b] for k, b in best.items()}
+    if hinge := best.get("revolute"):
+        far = int(np.argmax(np.abs(hinge.q)))
+        chord = hinge.twist.pose(hinge.q[[far]])[1][0] * np.sign(hinge.q[far])
+        along = hinge.twist.pose(hinge.q)[1] @ (chord / np.linalg.norm(chord))
+        slide = Twist(hinge.twist.anchor, chord / np.linalg.norm(chord), np.zeros(3))
+        out.setdefault("prismatic", []).append(replace(hinge, kind="prismatic", twist=slide, q=along - along[0]))
+        out["screw"] = [replace(hinge, kind="screw")]
+    if slide_b := best.get("prismatic"):
+        size = np.linalg.norm(np.ptp(slide_b.X, axis=0))
+        basis = np.linalg.svd(slide_b.twist.direction[None])[2][1:]
+        for e in (*basis, *-basis):
+            bent = replace(slide_b.twist, curvature=0.3 / size * e)
+            out.setdefault("revolute", []).append(replace(slide_b, kind="revolute", twist=bent))
+    return out
+
+
+def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, float]:
+    """Posterior of the types, from the curvature of the hinge and the advance of the screw."""
+    hinge = best["revolute"]
+    size = float(np.linalg.norm(np.quantile(hinge.X, 0.95, axis=0) - np.quantile(hinge.X, 0.05, axis=0)))
+    log = {"prismatic": 0.0, "revolute": log_odds_hinge(hinge.twist, spread(hinge, sight).curvature, size)}
+    if "screw" in best:
+        screw = best["screw"]
+        log["screw"] = log["revolute"] + log_odds_screw(screw.twist, spread(screw, sight).curvature)
+    return probabilities(log)
+
+
+def compact(X: np.ndarray, reach: float = 5.0) -> np.ndarray:
+    """(N,) bool: points near the others, within `reach` median absolute deviations in each principal direction.
+
+    A stray track that the joint happens to explain is placed far in front of or behind the link.
+    """
+    keep = np.ones(len(X), bool)
+    for _ in range(3):
+        Y = X - np.median(X[keep], axis=0)
+        _, _, vt = np.linalg.svd(Y[keep], full_matrices=False)
+        P = np.abs(Y @ vt.T)
+        scale = np.median(P[keep], axis=0)
+        # A plate is thin: its thickness is judged by its smaller side.
+        scale = np.maximum(scale, 0.15 * scale.max())
+        now = (P < reach * scale).all(1)
+        if now.sum() < 0.5 * len(X) or (now == keep).all():
+            break
+        keep = now
+    return keep
+
+
+def states_of_all_frames(b: Bundle, s: Sightings, some: np.ndarray) -> Bundle:
+    """States of the frames that the bundle adjustment left out: robust Gauss-Newton on one number a frame."""
+    T = s.seen.shape[1]
+    q = np.interp(np.arange(T), some, b.q)
+    out = replace(b, q=q)
+    left = np.ones(T, bool)
+    left[some] = False
+    span = max(np.ptp(q), 1e-9)
+    for _ in range(4):
+        r = residuals(out, s)
+        h = 1e-5 * span
+        J = (residuals(replace(out, q=out.q + h), s) - r) / h
+        _, w = robust_loss(r, s, ROBUST_SIGMAS * max(b.sigma, 0.05))
+        H = np.sum(w[..., None] * J * J, axis=(0, 2))
+        g = np.sum(w[..., None] * J * r, axis=(0, 2))
+        stiff = (b.sigma / (0.1 * span)) ** 2
+        neighbours = 0.5 * (np.roll(out.q, 1) + np.roll(out.q, -1))
+        step = -(g + stiff * (out.q - neighbours)) / (H + stiff)
+        out = replace(out, q=np.where(left, out.q + np.clip(step, -0.1 * span, 0.1 * span), out.q))
+    return out

@@ -1,0 +1,82 @@
+"""Which type: the hinge contains the slide and the screw contains both, so the question is what the curvature is.
+
+The slide is the hinge whose curvature w is zero. With the likelihood of w from the bundle adjustment (Gaussian, with
+the robust covariance) and a prior of where hinges are, the odds are the Savage-Dickey ratio
+(Dickey, 1971): the marginal likelihood with w free over that with w = 0. The screw against the hinge is the same
+question about w's part along the direction of motion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reconstruct.joint.twist import Twist
+
+PRIOR = {"revolute": 0.6, "prismatic": 0.37, "screw": 0.03}
+HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.6
+"""Median distance of a hinge from the link's middle over the link's size, and the standard deviation of its logarithm.
+The hinges of simulated furniture lie 0.34 to 0.64 link diagonals away (knobs less); texture on a part of the link only
+makes it look smaller."""
+
+
+def log_odds_hinge(twist: Twist, covariance: np.ndarray, size: float) -> float:
+    """Logarithm of the Bayes factor of a hinge against a slide.
+
+    Args:
+        twist: of the hinge.  covariance: (3, 3) of its curvature.  size: of the link, in the twist's units.
+    """
+    basis = _across(twist)
+    w = basis.T @ twist.curvature
+    P = np.linalg.inv(basis.T @ covariance @ basis + 1e-12 * np.eye(2) / size**2)
+    # Polar quadrature over the prior: log-normal radius, any direction.
+    z = np.linspace(-3.5, 3.5, 141)
+    radius = 1.0 / (size * HINGE_RADIUS * np.exp(HINGE_SPREAD * z))
+    angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    e = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    weight = np.exp(-0.5 * z**2)
+    weight /= weight.sum()
+    d = radius[:, None, None] * e - w
+    log = -0.5 * np.einsum("zai,ij,zaj->za", d, P, d) + np.log(weight)[:, None] - np.log(len(angle))
+    # A sharp likelihood falls between the nodes: Laplace's approximation there.
+    top = log.max()
+    grid = float(top + np.log(np.exp(log - top).sum()))
+    k = np.linalg.norm(w)
+    zw = np.log(1.0 / (max(k, 1e-12) * size * HINGE_RADIUS)) / HINGE_SPREAD
+    density = -0.5 * zw**2 - np.log(np.sqrt(2 * np.pi) * HINGE_SPREAD) - np.log(2 * np.pi * max(k, 1e-12) ** 2)
+    laplace = float(density + np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(P)[1])
+    sharp = np.sqrt(1.0 / np.linalg.eigvalsh(P)[-1]) < 0.1 * k
+    return (laplace if sharp else grid) + 0.5 * float(w @ P @ w)
+
+
+SCREW_ADVANCE = (0.08, 0.8)
+"""Advance of a screw over its path: a hinge whose fit creeps by less along its axis is a hinge."""
+
+
+def log_odds_screw(twist: Twist, covariance: np.ndarray) -> float:
+    """Logarithm of the Bayes factor of a screw against a hinge: advance uniform in SCREW_ADVANCE, of either sign."""
+    d = twist.direction
+    k = np.linalg.norm(twist.curvature)
+    if k <= 0:
+        return -np.inf
+    share = float(twist.curvature @ d) / k
+    std = float(np.sqrt(max(d @ covariance @ d, 1e-18))) / k
+    lo, hi = SCREW_ADVANCE
+    x = np.linspace(lo, hi, 400)
+    log = np.concatenate([-0.5 * ((x - share) / std) ** 2, -0.5 * ((x + share) / std) ** 2])
+    top = log.max()
+    return float(top + np.log(np.exp(log - top).mean()) + 0.5 * (share / std) ** 2)
+
+
+def probabilities(log_odds: dict[str, float]) -> dict[str, float]:
+    """Posterior of the types from log marginal likelihoods and the prior."""
+    log = {k: v + np.log(PRIOR[k]) for k, v in log_odds.items()}
+    top = max(log.values())
+    p = {k: float(np.exp(max(v - top, -50.0))) for k, v in log.items()}
+    return {k: v / sum(p.values()) for k, v in p.items()}
+
+
+def _across(twist: Twist) -> np.ndarray:
+    """(3, 2) basis of the curvatures that a hinge may have: perpendicular to the motion."""
+    from reconstruct.joint.hypotheses import perpendicular_basis
+
+    return perpendicular_basis(twist.direction)

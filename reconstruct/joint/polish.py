@@ -1,0 +1,295 @@
+"""Maximum-likelihood bundle adjustment of one joint over all tracks and all frames.
+
+Unknown: the twist (see twist.py), the state in every frame, every track's point in 3D and, where it is not given, the
+focal length. The points are eliminated (Schur complement, 3 x 3 blocks), so that a step costs one dense solve in the
+number of frames. The loss is Geman-McClure's with a scale that follows the measured noise: near to efficient for
+Gaussian noise, and stray observations drop out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reconstruct.joint.twist import Twist
+
+BEND = 0.1
+"""Standard deviation of q's second difference over its range: weak, it decides only where few tracks are seen."""
+ROBUST_SIGMAS = 4.0
+"""Scale of the loss in standard deviations of the noise: 97 % efficient for Gaussian noise."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Observations of one link.
+
+    Attributes:
+        uv: (N, T, 2) px from the principal point (0 where not seen).  seen: (N, T) bool.
+        weight: (N,) of each track.
+        focal: px.  focal_std: of its logarithm; 0 where it is known.
+        R, t: (T, 3, 3), (T, 3) world to camera; None for a static camera, whose frame is the world then.
+        frames: (T,) frame numbers; 0 .. T-1 when None.
+        lasting: frames over which a track's error stays alike: so many observations weigh against a prior as one.
+    """
+
+    uv: np.ndarray
+    seen: np.ndarray
+    weight: np.ndarray
+    focal: float
+    focal_std: float = 0.0
+    R: np.ndarray | None = None
+    t: np.ndarray | None = None
+    frames: np.ndarray | None = None
+    lasting: float = 1.0
+
+    @property
+    def bend(self) -> np.ndarray:
+        """(T, T) sum of squared second differences of q: what fills frames that nothing observes."""
+        T = self.seen.shape[1]
+        f = np.arange(T) if self.frames is None else self.frames
+        D = second_difference(f / max(float(np.mean(np.diff(f))), 1e-9))
+        return D.T @ D
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A fitted joint.
+
+    Attributes:
+        kind: "revolute", "prismatic" or "screw".  twist: the joint.  q: (T,) path length at the anchor, q[0] = 0.
+        X: (N, 3) points at q = 0, world.  log_focal: correction of the focal length's logarithm.
+        cost: robust cost in px^2.  sigma: noise of one coordinate, px.
+    """
+
+    kind: str
+    twist: Twist
+    q: np.ndarray
+    X: np.ndarray
+    log_focal: float = 0.0
+    cost: float = np.inf
+    sigma: float = 1.0
+
+
+def positions(b: Bundle, s: Sightings) -> tuple[np.ndarray, np.ndarray]:
+    """Points in all frames: world and camera frame, (N, T, 3) each."""
+    R, p = b.twist.pose(b.q)
+    y = np.einsum("tij,nj->nti", R, b.X - b.twist.anchor)
+    world = y + p + b.twist.anchor
+    if s.R is None:
+        return world, world
+    return world, np.einsum("tij,ntj->nti", s.R, world) + s.t
+
+
+def residuals(b: Bundle, s: Sightings, cam: np.ndarray | None = None) -> np.ndarray:
+    """(N, T, 2) px, 0 where not seen."""
+    cam = positions(b, s)[1] if cam is None else cam
+    z = np.maximum(cam[..., 2:], 1e-3)
+    r = s.focal * np.exp(b.log_focal) * cam[..., :2] / z - s.uv
+    r = np.where(cam[..., 2:] < 1e-3, 1e3, r)
+    return np.where(s.seen[..., None], r, 0.0)
+
+
+def second_difference(frames: np.ndarray) -> np.ndarray:
+    """(T-2, T) second differences for uneven spacing."""
+    T = len(frames)
+    h0, h1 = np.diff(frames)[:-1], np.diff(frames)[1:]
+    D = np.zeros((max(T - 2, 0), T))
+    k = np.arange(max(T - 2, 0))
+    D[k, k], D[k, k + 1], D[k, k + 2] = 2 / (h0 * (h0 + h1)), -2 / (h0 * h1), 2 / (h1 * (h0 + h1))
+    return D
+
+
+def noise(r: np.ndarray, seen: np.ndarray) -> float:
+    """Standard deviation of one coordinate from the median residual, px."""
+    r2 = np.sum(r**2, axis=-1)[seen]
+    return float(np.sqrt(max(np.median(r2) / (2 * np.log(2)), 1e-6))) if len(r2) else 1.0
+
+
+def robust_loss(r: np.ndarray, s: Sightings, scale: float) -> tuple[float, np.ndarray]:
+    g = scale**2 / (scale**2 + np.sum(r**2, axis=-1))
+    w = s.weight[:, None] * s.seen
+    return float(np.sum(w * scale**2 * (1 - g))), w * g**2
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Gauss-Newton blocks: dense (twist, focal, q), points, coupling.
+
+    Attributes:
+        H: (P, P).  g: (P,).  Hp: (N, 3, 3).  gp: (N, 3).  C: (P, N, 3).  Z: (6, G) tangent basis of the twist.
+        scores: (N, P) each track's part of g.
+    """
+
+    H: np.ndarray
+    g: np.ndarray
+    Hp: np.ndarray
+    gp: np.ndarray
+    C: np.ndarray
+    Z: np.ndarray
+    scores: np.ndarray
+
+    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Schur complement, its right side, and the points' inverse blocks."""
+        diagonal = np.einsum("nii->ni", self.Hp)
+        floor = 1e-9 * diagonal.sum(1, keepdims=True) + 1e-12
+        inv = np.linalg.inv(self.Hp + (damping * diagonal + floor)[..., None] * np.eye(3))
+        CI = np.einsum("pni,nij->pnj", self.C, inv)
+        flat = self.C.reshape(len(self.C), -1)
+        S = self.H - CI.reshape(len(CI), -1) @ flat.T
+        return S, self.g - np.einsum("pni,ni->p", CI, self.gp), inv
+
+
+def normal_equations(
+    b: Bundle, s: Sightings, world: np.ndarray, cam: np.ndarray, r: np.ndarray, w: np.ndarray
+) -> Normal:
+    """Blocks of the weighted problem; parameters are (twist tangent, log focal, q_1 .. q_T)."""
+    N, T = s.seen.shape
+    f = s.focal * np.exp(b.log_focal)
+    z = np.maximum(cam[..., 2], 1e-3)
+    # Rows of the projection's derivative, (N, T, 2, 3), turned into the world frame.
+    P = np.zeros((N, T, 2, 3))
+    P[..., 0, 0] = P[..., 1, 1] = f / z
+    P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
+    if s.R is not None:
+        P = P @ s.R
+    tw = b.twist
+    R, p = tw.pose(b.q)
+    Jx = P @ R
+    Z = tw.tangent(b.kind)
+
+    by_d = tw.displacement_by_direction(b.q) @ Z[:3]  # (T, 3, G)
+    by_w = tw.displacement_by_curvature(b.q) @ Z[3:]
+    turn = b.q[:, None, None] * (tw.left_jacobian(b.q) @ Z[3:])  # rotation vector's change, (T, 3, G)
+    y = world - p - tw.anchor
+    dX = by_d + by_w + np.cross(turn.swapaxes(-1, -2)[None], y[:, :, None]).swapaxes(-1, -2)  # (N, T, 3, G)
+    Jg = P @ dX
+    if s.focal_std > 0:
+        Jf = (f * cam[..., :2] / z[..., None])[..., None]
+        Jg = np.concatenate([Jg, Jf], axis=-1)
+    Jq = (P @ (np.cross(tw.curvature, world - tw.anchor) + tw.direction)[..., None])[..., 0]
+    A = Jg.shape[-1]
+    wr = w[..., None] * r
+    wJg = w[..., None, None] * Jg
+    H, g = np.zeros((A + T, A + T)), np.zeros(A + T)
+    flat = lambda J: J.reshape(-1, J.shape[-1])  # noqa: E731
+    H[:A, :A] = flat(wJg).T @ flat(Jg)
+    g[:A] = flat(wJg).T @ r.reshape(-1)
+    wJq = w[..., None] * Jq
+    H[np.arange(A, A + T), np.arange(A, A + T)] = np.sum(wJq * Jq, axis=(0, 2))
+    g[A:] = np.sum(wJq * r, axis=(0, 2))
+    H[:A, A:] = np.einsum("ntia,nti->at", Jg, wJq, optimize=True)
+    H[A:, :A] = H[:A, A:].T
+    wJx = w[..., None, None] * Jx
+    Jx2 = Jx.reshape(N, 2 * T, 3)
+    Hp = wJx.reshape(N, 2 * T, 3).swapaxes(1, 2) @ Jx2
+    gp = np.einsum("ntij,nti->nj", Jx, wr)
+    C = np.empty((A + T, N, 3))
+    C[:A] = (wJg.reshape(N, 2 * T, A).swapaxes(1, 2) @ Jx2).swapaxes(0, 1)
+    C[A:] = np.einsum("nti,ntij->tnj", wJq, Jx)
+    scores = np.concatenate([np.einsum("ntia,nti->na", wJg, r), np.sum(wJq * r, axis=-1)], axis=1)
+    return Normal(H, g, Hp, gp, C, Z, scores)
+
+
+def _prior(b: Bundle, s: Sightings, noise2: float) -> tuple[float, int]:
+    """Weight of the focal prior in px^2, and its row (or -1)."""
+    if s.focal_std <= 0:
+        return 0.0, -1
+    return noise2 * s.lasting / s.focal_std**2, b.twist.tangent(b.kind).shape[1]
+
+
+def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = None, sharpen: bool = True) -> Bundle:
+    """Levenberg-Marquardt from a good start.
+
+    Args:
+        b: start.  s: observations.
+        scale: of the loss, px; from the measured noise when None.
+        sharpen: measure the noise again half-way.
+    """
+    T = s.seen.shape[1]
+    bend = s.bend
+    world, cam = positions(b, s)
+    r = residuals(b, s, cam)
+    for stage in range(2 if sharpen else 1):
+        sigma = noise(r, s.seen)
+        limit = scale or ROBUST_SIGMAS * max(sigma, 0.05) * (2.0 if sharpen and stage == 0 else 1.0)
+        damping = 1e-4
+        pull, row = _prior(b, s, sigma**2)
+        stiff = bend * (sigma / (BEND * max(np.ptp(b.q), 1e-9))) ** 2
+        cost, w = robust_loss(r, s, limit)
+        cost += pull * b.log_focal**2 + float(b.q @ stiff @ b.q)
+        for _ in range(iterations):
+            n = normal_equations(b, s, world, cam, r, w)
+            if row >= 0:
+                n.H[row, row] += pull
+                n.g[row] += pull * b.log_focal
+            A = len(n.H) - T
+            n.H[A:, A:] += stiff
+            n.g[A:] += stiff @ b.q
+            better = False
+            for _ in range(5):
+                S, rhs, inv = n.reduced(damping)
+                # States that nothing observes stay where they are; q[0] is the gauge.
+                S[A, A] += 1e6 * np.trace(S) / len(S)
+                S = S + damping * np.diag(np.diag(S)) + 1e-10 * np.trace(S) / len(S) * np.eye(len(S))
+                try:
+                    step = -np.linalg.solve(S, rhs)
+                except np.linalg.LinAlgError:
+                    damping *= 10
+                    continue
+                dX = -np.einsum("nij,nj->ni", inv, n.gp + np.einsum("pni,p->ni", n.C, step))
+                trial = _stepped(b, n, step, dX, row)
+                world_t, cam_t = positions(trial, s)
+                r_t = residuals(trial, s, cam_t)
+                cost_t, w_t = robust_loss(r_t, s, limit)
+                cost_t += pull * trial.log_focal**2 + float(trial.q @ stiff @ trial.q)
+                if cost_t < cost:
+                    better = cost - cost_t > 1e-7 * cost
+                    b, world, cam, r, w, cost = trial, world_t, cam_t, r_t, w_t, cost_t
+                    damping = max(damping / 10, 1e-9)
+                    break
+                damping = max(damping * 10, 1e-6)
+            if not better:
+                break
+    return replace(b, cost=cost, sigma=noise(r, s.seen))
+
+
+def _stepped(b: Bundle, n: Normal, step: np.ndarray, dX: np.ndarray, row: int) -> Bundle:
+    T = len(b.q)
+    A = len(step) - T
+    G = n.Z.shape[1]
+    limit = 0.5 * np.linalg.norm(b.X, axis=1, keepdims=True)
+    size = np.linalg.norm(dX, axis=1, keepdims=True)
+    X = b.X + dX * np.minimum(1.0, limit / np.maximum(size, 1e-12))
+    q = b.q + step[A:]
+    twist = b.twist.moved(n.Z @ step[:G], b.kind)
+    log_focal = b.log_focal + (float(step[row]) if row >= 0 else 0.0)
+    return replace(b, twist=twist, q=q - q[0], X=X, log_focal=log_focal)
+
+
+def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
+    """Every track's point for a given motion: robust Gauss-Newton on each alone, from the depth of the others.
+
+    Args:
+        b: joint and states; its X are the starts, (N, 3).
+        s: observations of N tracks.
+    """
+    limit = ROBUST_SIGMAS * max(b.sigma, 0.05)
+    for k in range(rounds):
+        world, cam = positions(b, s)
+        r = residuals(b, s, cam)
+        _, w = robust_loss(r, replace(s, weight=np.ones(len(s.weight))), limit * (8.0, 4.0, 2.0, 1.0)[min(k, 3)])
+        f = s.focal * np.exp(b.log_focal)
+        z = np.maximum(cam[..., 2], 1e-3)
+        P = np.zeros((*z.shape, 2, 3))
+        P[..., 0, 0] = P[..., 1, 1] = f / z
+        P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
+        J = (P if s.R is None else P @ s.R) @ b.twist.pose(b.q)[0]
+        H = np.einsum("nt,ntij,ntik->njk", w, J, J, optimize=True)
+        g = np.einsum("nt,ntij,nti->nj", w, J, r, optimize=True)
+        H += (1e-4 * np.trace(H, axis1=1, axis2=2) / 3 + 1e-12)[:, None, None] * np.eye(3)
+        step = -np.linalg.solve(H, g[..., None])[..., 0]
+        limit_step = 0.4 * np.linalg.norm(b.X, axis=1)
+        step *= np.minimum(1, limit_step / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]
+        b = replace(b, X=b.X + step)
+    return b
