@@ -1,110 +1,63 @@
-"""Evidence for and against a joint: held-out frames, and a free rigid body as the rival."""
+"""Evidence against a joint: motion that it leaves unexplained, and a free rigid body as the rival."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruct.joint.bundle import Observations, State, refine, reprojection, transport
-from reconstruct.joint.select import SCORE_PX, explained, explained_by
+from reconstruct.joint.bundle import Observations, State, reprojection, transport
+from reconstruct.joint.polish import Bundle, Sightings, residuals
+from reconstruct.joint.select import explained, explained_by
 
 
-def held_out_costs(s: State, obs: Observations, fold: int = 3, scale: float = SCORE_PX) -> np.ndarray:
-    """(N,) robust cost of every track in frames that its fit did not see.
+@dataclass(frozen=True)
+class Bridged:
+    """How well the joint explains the motion from one state to the next.
 
-    Each third of the key frames is left out in turn: joint and depths come from the others, and only the
-    state of the left-out frame is then fitted to it (one number for all tracks).
+    Attributes:
+        error: median over the stroke of a step's prediction error over its length, in the picture.
+        supported: share of the stroke over which at least MIN_BRIDGE tracks are followed.
     """
-    K = len(obs.frames)
-    cost = np.zeros(len(obs.ref))
-    for part in range(fold):
-        out = np.arange(K) % fold == part
-        ref_lost = out[obs.ref]
-        train = replace(obs, seen=obs.seen & ~out)
-        # Tracks whose reference key is left out get another one.
-        other = np.where(train.seen.any(1), train.seen.argmax(1), obs.ref)
-        train = replace(train, ref=np.where(ref_lost, other, obs.ref))
-        X, _ = transport(s, obs)
-        depth = np.maximum(X[np.arange(len(obs.ref)), train.ref, 2], 1e-3)
-        fitted = refine(replace(s, depth=depth), train, scales=(3.0,), iterations=6)
-        q = fitted.q.copy()
-        test = replace(obs, ref=train.ref)
-        for k in np.flatnonzero(out):
-            q[k] = _state_of_frame(fitted, q, test, k)
-        X, _ = transport(replace(fitted, q=q), test)
-        r2 = np.sum(reprojection(X, test) ** 2, axis=-1)
-        usable = obs.seen & out & train.seen.any(1)[:, None]
-        cost += np.where(usable, r2 / (1 + r2 / scale**2), 0).sum(1)
-    return cost
+
+    error: float
+    supported: float
 
 
-def _state_of_frame(s: State, q: np.ndarray, obs: Observations, k: int) -> float:
-    """Robust Gauss-Newton on one state."""
-    value = float(np.interp(k, [k - 1, k + 1], [q[max(k - 1, 0)], q[min(k + 1, len(q) - 1)]]))
-    use = obs.seen[:, k]
-    if not use.any():
-        return value
-    one = replace(obs, seen=obs.seen & (np.arange(obs.seen.shape[1]) == k))
-    h = 1e-4 * max(np.ptp(q), 1e-3)
-    for _ in range(6):
-        r = []
-        for delta in (0.0, h):
-            trial = q.copy()
-            trial[k] = value + delta
-            r.append(reprojection(transport(replace(s, q=trial), one)[0], one)[:, k])
-        J = (r[1] - r[0]) / h
-        w = obs.weight * use / (1 + np.sum(r[0] ** 2, axis=-1) / SCORE_PX**2) ** 2
-        step = -np.sum(w[:, None] * J * r[0]) / (np.sum(w[:, None] * J * J) + 1e-12)
-        value += float(np.clip(step, -0.3 * np.ptp(q), 0.3 * np.ptp(q)))
-    return value
+MIN_BRIDGE = 5
+STEPS = 10
 
 
-FAR_HINGE = 2.0
-"""A hinge farther from the link than this many link sizes is unusual; the odds fall with the ratio's square."""
+def bridged(b: Bundle, s: Sightings) -> Bridged:
+    """The joint step by step: a body that rests, is carried away and rests again agrees with many joints at its rests.
 
-
-def type_probability(states: dict[str, State], obs: Observations) -> dict[str, float]:
-    """Probability of each type from held-out frames.
-
-    A flexible model explains stray tracks that are not on the link, so types are compared on the tracks that
-    both explain, where these are at least half of what the better one explains. Residuals of one track are
-    strongly correlated in time, and those of neighbours in space: each track counts as one observation with
-    its density weight. A hinge has one more parameter than a slide (Schwarz's criterion), and a hinge many link
-    sizes away is a slide in all but name.
+    The stroke is cut into STEPS pieces of equal path in q (there and back count); in each piece, the displacement of
+    the tracks that live through it is compared with the predicted one.
     """
-    names = list(states)
-    if len(names) == 1:
-        return {names[0]: 1.0}
-    costs = {n: held_out_costs(states[n], obs) for n in names}
-    links = {n: explained(states[n], obs)[1] > 0.5 for n in names}
-    common = np.logical_and.reduce([links[n] for n in names])
-    if common.sum() < 0.5 * max(links[n].sum() for n in names):
-        common = np.logical_or.reduce([links[n] for n in names])
-    log = {}
-    effective = max(float(obs.weight[common].sum()), 2.0)
-    for n in names:
-        mean = float(
-            (obs.weight[common] * costs[n][common]).sum() / (obs.weight[common] @ obs.seen[common].sum(1) + 1e-9)
-        )
-        parameters = 3 if n == "revolute" else 2
-        log[n] = -effective * np.log(max(mean, 0.05)) - 0.5 * parameters * np.log(effective)
-        if n == "revolute":
-            log[n] -= 2 * np.log(max(hinge_distance(states[n], obs, common) / FAR_HINGE, 1.0))
-    top = max(log.values())
-    p = {n: float(np.exp(max(v - top, -50.0))) for n, v in log.items()}
-    return {n: v / sum(p.values()) for n, v in p.items()}
-
-
-def hinge_distance(s: State, obs: Observations, link: np.ndarray) -> float:
-    """Distance of the hinge from the link's middle, over the link's size."""
-    X, _ = transport(s, obs)
-    base = int(np.argmax(obs.seen[link].sum(0)))
-    P = X[link & obs.seen[:, base], base]
-    if len(P) < 4:
-        return 0.0
-    size = np.linalg.norm(np.quantile(P, 0.9, axis=0) - np.quantile(P, 0.1, axis=0))
-    return float(np.median(np.linalg.norm(np.cross(P - s.point, s.axis), axis=1)) / max(size, 1e-9))
+    path = np.concatenate([[0], np.cumsum(np.abs(np.diff(b.q)))])
+    cuts = np.unique(np.searchsorted(path, np.linspace(0, path[-1], STEPS + 1)).clip(0, len(path) - 1))
+    predicted = s.uv + residuals(b, s)
+    errors, lengths = [], []
+    for k, m in zip(cuts[:-1], cuts[1:], strict=True):
+        both = s.seen[:, k] & s.seen[:, m]
+        if both.sum() < MIN_BRIDGE:
+            errors.append(np.nan)
+            lengths.append(path[m] - path[k])
+            continue
+        moved = s.uv[both, m] - s.uv[both, k]
+        wrong = predicted[both, m] - predicted[both, k] - moved
+        size = np.linalg.norm(moved, axis=-1)
+        far = size >= np.median(size)
+        errors.append(float(np.median(np.linalg.norm(wrong[far], axis=-1)) / max(np.median(size[far]), 3 * b.sigma)))
+        lengths.append(path[m] - path[k])
+    e, w = np.array(errors), np.array(lengths)
+    known = np.isfinite(e)
+    if not known.any():
+        return Bridged(np.inf, 0.0)
+    order = np.argsort(e[known])
+    share = np.cumsum(w[known][order]) / w[known].sum()
+    return Bridged(float(e[known][order][np.searchsorted(share, 0.5).clip(0, known.sum() - 1)]),
+                   float(w[known].sum() / w.sum()))  # fmt: skip
 
 
 @dataclass(frozen=True)

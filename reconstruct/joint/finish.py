@@ -129,23 +129,62 @@ def finish(starts: dict[str, tuple[State, Observations]], uv: np.ndarray, ids: n
         best[kind] = min((polish(b, sight) for b in b), key=lambda b: b.cost)
     probability = type_probabilities(best, sight)
     kind = max(probability, key=lambda k: probability[k])
-    b, every = best[kind], sightings(uv[ids], focal, focal_std, np.arange(T))
-    every = replace(every, weight=np.ones(len(ids)))
+    b, members = best[kind], ids[pick]
+    more, X = followers(b, uv[:, some], np.setdiff1d(np.arange(len(uv)), members), sight)
+    members = np.concatenate([members, more])
+    b = replace(b, X=np.concatenate([b.X, X]))
+    # The bundle adjustment keeps its bound; whatever is above it gets its point only.
+    sight = replace(sightings(uv[members][:, some], focal, focal_std, some), lasting=lasting)
+    sight = replace(sight, weight=shared_weights(rho, clusters(b)))
+    bound = np.arange(len(members))
+    if len(members) > MOST_TRACKS:
+        bound = np.linspace(0, len(members) - 1, MOST_TRACKS).round().astype(int)
+    few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=sight.weight[bound])
+    last = polish(replace(b, X=b.X[bound]), few)
+    sure = spread(last, few)
+    b = place_points(replace(last, X=b.X), sight, rounds=3) if len(bound) < len(members) else last
+    every = replace(sightings(uv[members], focal, focal_std, np.arange(T)), weight=sight.weight, lasting=lasting)
     if len(some) < T:
-        own = replace(every, weight=every.weight[pick], uv=every.uv[pick], seen=every.seen[pick])
-        b = states_of_all_frames(b, own, some)
-    if len(pick) < len(ids):
-        X = np.tile(np.median(b.X, axis=0), (len(ids), 1))
-        X[pick] = b.X
-        b = place_points(replace(b, X=X), every)
-        near = np.isin(np.arange(len(ids)), pick) | compact(b.X)
-        ids, b = ids[near], replace(b, X=b.X[near])
-        every = replace(every, uv=every.uv[near], seen=every.seen[near], weight=every.weight[near])
-    sure = spread(best[kind], sight)
-    if len(some) < T:
+        b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
-    every = replace(every, weight=shared_weights(rho, clusters(b)), lasting=lasting)
-    return Finished(b, every, ids, sure, probability, rho, lasting)
+    return Finished(b, every, members, sure, probability, rho, lasting)
+
+
+SURE = 20.0
+"""Log-likelihood by which a further track has to prefer the joint's motion to standing still."""
+
+
+def followers(b: Bundle, uv: np.ndarray, ids: np.ndarray, like: Sightings, most: int = 800):
+    """Further tracks that move with the link, however little: those near the axis hold it best.
+
+    Args:
+        b: the fitted joint.  uv: (N, T, 2) of all tracks in its frames.  ids: (m,) those to look at.
+        like: the fit's observations, for focal length, frames and noise.
+
+    Returns:
+        (k,) indices of the followers, and (k, 3) their points.
+    """
+    sigma = max(b.sigma, 0.05)
+    extent = np.full(len(ids), 0.0)
+    some = np.isfinite(uv[ids, :, 0]).sum(1) >= 4
+    extent[some] = np.linalg.norm(np.nanmax(uv[ids[some]], axis=1) - np.nanmin(uv[ids[some]], axis=1), axis=-1)
+    ids = ids[extent > 8 * sigma]
+    if not len(ids):
+        return ids, np.zeros((0, 3))
+    if len(ids) > most:
+        ids = ids[np.linspace(0, len(ids) - 1, most).round().astype(int)]
+    s = sightings(uv[ids], like.focal, like.focal_std, like.frames)
+    own = len(b.X)
+    trial = place_points(replace(b, X=np.tile(np.median(b.X, axis=0), (len(ids), 1))), s)
+    r = residuals(trial, s)
+    rest = np.where(s.seen[..., None], s.uv - np.nanmedian(uv[ids], axis=1)[:, None], 0.0)
+    limit = ROBUST_SIGMAS * sigma
+    cost = lambda e: np.sum(s.seen * limit**2 * (1 - limit**2 / (limit**2 + np.sum(e**2, axis=-1))), axis=1)  # noqa: E731
+    gain = (cost(rest) - cost(r)) / (2 * sigma**2 * like.lasting)
+    size = np.sqrt(np.nanmedian(np.where(s.seen, np.sum(r**2, axis=-1), np.nan), axis=1))
+    good = (gain > SURE) & (size < 2.5 * sigma) & (trial.X[:, 2] > 0)
+    good &= compact(np.concatenate([b.X, trial.X]))[own:]
+    return ids[good], trial.X[good]
 
 
 def sightings(uv: np.ndarray, focal: float, focal_std: float, frames: np.ndarray) -> Sightings:

@@ -9,7 +9,7 @@ import numpy as np
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
-from reconstruct.joint.evidence import free_motion, type_probability
+from reconstruct.joint.evidence import bridged, free_motion
 from reconstruct.joint.finish import Finished, finish
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
@@ -20,6 +20,7 @@ from reconstruct.video import Video
 MOVING_SHARE = 0.012
 """A track moves if its extent exceeds this share of the image diagonal."""
 MIN_INLIERS = 8
+BRIDGED_SHARE, BRIDGED_ERROR = 0.5, 0.3
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
 PRIOR_STD = 0.12
@@ -72,12 +73,13 @@ def fit_joint(
             found = max(tries, key=lambda t: t.explained)
             note = f"; no joint explains the whole video: the dominant of {len(stretches)} stretches of motion is taken"
     if found.refusal:
-        return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members),
-                        type_probability=found.probability)  # fmt: skip
+        return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members))
     tell(0.9)
 
     done = finish(found.starts, uv - camera.centre, found.members, camera.focal, 0.0 if known else PRIOR_STD)
     tell(1.0)
+    if reason := _why_not_bridged(done):
+        return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
 
 
@@ -96,14 +98,13 @@ class _Consensus:
 
     Attributes:
         starts: per type, a state with depths of the following tracks, and their key-frame observations.
-        members: (n,) indices of these tracks.  probability: of the types.
+        members: (n,) indices of these tracks.
         explained: motion of all tracks that it explains.
         refusal: a sentence, or "".  scattered: True if too few tracks agree on anything.
     """
 
     starts: dict[str, tuple[State, Observations]] = field(default_factory=dict)
     members: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    probability: dict[str, float] = field(default_factory=dict)
     explained: float = 0.0
     refusal: str = ""
     scattered: bool = False
@@ -134,8 +135,7 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
         best.setdefault(s.kind, s)
     if not best:
         return _Consensus(refusal="no tracks move together for long enough to draw a joint", scattered=True)
-    probability = type_probability(best, obs)
-    s = best[max(probability, key=lambda kind: probability[kind])]
+    s = max(best.values(), key=lambda s: explained(s, obs)[0])
 
     # All moving tracks, not just the sample of the search, for the consensus set.
     every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
@@ -147,7 +147,7 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
                         every.frames)  # fmt: skip
     starts = {kind: (_redepth(b, link), link) for kind, b in best.items()}
     starts[s.kind] = (replace(s, depth=s.depth[follows]), link)
-    return _Consensus(starts, moving[ids[follows]], probability, total,
+    return _Consensus(starts, moving[ids[follows]], total,
                       _why_refused(s, every, follows) or "", bool(few))  # fmt: skip
 
 
@@ -172,6 +172,18 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
             f"the part moves as a free body, not about one joint: {free.unexplained:.0%} of its points that move most "
             f"do not follow the best joint ({s.kind}; median residual {free.joint_px:.1f} px against "
             f"{free.free_px:.1f} px for a free rigid body, working pixels)"
+        )
+    return None
+
+
+def _why_not_bridged(done: Finished) -> str | None:
+    b = bridged(done.bundle, done.sight)
+    if b.supported < BRIDGED_SHARE:
+        return f"too few tracks last through the motion: {1 - b.supported:.0%} of the stroke is seen by hardly any"
+    if b.error > BRIDGED_ERROR:
+        return (
+            f"no joint: from one state to the next the best one ({done.bundle.kind}) misses {b.error:.0%} of the way "
+            "that its own points go"
         )
     return None
 
