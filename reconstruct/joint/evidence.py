@@ -16,7 +16,7 @@ class Bridged:
     """How well the joint explains the motion from one state to the next.
 
     Attributes:
-        error: median over the stroke of a step's prediction error over its length, in the picture.
+        error: mean over the stroke of a step's prediction error over its length in the picture, each at most 1.
         supported: share of the stroke over which at least MIN_BRIDGE tracks are followed.
     """
 
@@ -24,7 +24,7 @@ class Bridged:
     supported: float
 
 
-MIN_BRIDGE = 5
+MIN_BRIDGE = 3
 STEPS = 10
 
 
@@ -48,16 +48,15 @@ def bridged(b: Bundle, s: Sightings) -> Bridged:
         wrong = predicted[both, m] - predicted[both, k] - moved
         size = np.linalg.norm(moved, axis=-1)
         far = size >= np.median(size)
-        errors.append(float(np.median(np.linalg.norm(wrong[far], axis=-1)) / max(np.median(size[far]), 3 * b.sigma)))
+        # Two noisy ends miss each other by 1.7 standard deviations in the median.
+        excess = max(float(np.median(np.linalg.norm(wrong[far], axis=-1))) - 2.5 * b.sigma, 0.0)
+        errors.append(excess / max(float(np.median(size[far])), 3 * b.sigma))
         lengths.append(path[m] - path[k])
     e, w = np.array(errors), np.array(lengths)
     known = np.isfinite(e)
     if not known.any():
-        return Bridged(np.inf, 0.0)
-    order = np.argsort(e[known])
-    share = np.cumsum(w[known][order]) / w[known].sum()
-    return Bridged(float(e[known][order][np.searchsorted(share, 0.5).clip(0, known.sum() - 1)]),
-                   float(w[known].sum() / w.sum()))  # fmt: skip
+        return Bridged(1.0, 0.0)
+    return Bridged(float(np.average(np.minimum(e[known], 1.0), weights=w[known])), float(w[known].sum() / w.sum()))
 
 
 @dataclass(frozen=True)

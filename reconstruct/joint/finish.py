@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,11 +49,11 @@ class Finished:
     lasting: float
 
 
-def bundle_of_state(s: State, obs: Observations, uv: np.ndarray, frames: np.ndarray) -> Bundle:
+def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
     """A key-frame state as a start for all frames, with the link's median depth as the unit.
 
     Args:
-        s, obs: of the search.  uv: (n, T, 2) of the same tracks, in frames (T,).
+        s, obs: of the search.  frames: (T,) frame numbers.
     """
     rays = obs.ref_rays
     zero = replace(
@@ -85,33 +86,60 @@ def _anchor(kind: str, X: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np
     return middle
 
 
-def finish(starts: dict[str, tuple[State, Observations]], uv: np.ndarray, ids: np.ndarray, focal: float,
-           focal_std: float) -> Finished:  # fmt: skip
+@dataclass(frozen=True)
+class View:
+    """How the tracks were seen.
+
+    Attributes:
+        focal: px.  focal_std: of its logarithm, 0 where it is known.
+        R, t: (T, 3, 3), (T, 3) world to camera; None for a static camera.
+    """
+
+    focal: float
+    focal_std: float = 0.0
+    R: np.ndarray | None = None
+    t: np.ndarray | None = None
+
+    def sightings(self, uv: np.ndarray, frames: np.ndarray, lasting: float = 1.0) -> Sightings:
+        """Of tracks (n, T, 2) in some frames."""
+        uv = uv[:, frames]
+        seen = np.isfinite(uv[..., 0])
+        R, t = (None, None) if self.R is None else (self.R[frames], self.t[frames])
+        return Sightings(np.where(seen[..., None], uv, 0.0), seen, np.ones(len(uv)), self.focal, self.focal_std, R, t,
+                         frames, lasting)  # fmt: skip
+
+
+Starts = Mapping[str, tuple[State, Observations] | Bundle]
+
+
+def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View) -> Finished:
     """Polish every type on the same tracks and decide between them.
 
     Args:
-        starts: per type, a state with depths of the tracks `ids` and their key-frame observations.
+        starts: per type, a state with depths of the tracks `ids` and their key-frame observations, or a bundle of these
+            tracks in all frames.
         uv: (N, T, 2) px from the principal point, NaN where not seen.
         ids: (n,) tracks that the answer is fitted to.
-        focal: px.  focal_std: of its logarithm, 0 where it is known.
+        view: focal length and camera.
     """
     T = uv.shape[1]
     some = np.arange(T)
     if T > MOST_FRAMES:
-        keys = next(iter(starts.values()))[1].frames
-        some = np.unique(np.concatenate([keys, np.linspace(0, T - 1, MOST_FRAMES).round().astype(int)]))
+        some = np.unique(np.linspace(0, T - 1, MOST_FRAMES).round().astype(int))
     pick = np.arange(len(ids))
     if len(ids) > MOST_TRACKS:
         pick = np.linspace(0, len(ids) - 1, MOST_TRACKS).round().astype(int)
-    sight = sightings(uv[ids[pick]][:, some], focal, focal_std, some)
+    # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
+    sight = view.sightings(uv[ids[pick]], some, lasting=100.0)
     best: dict[str, Bundle] = {}
-    for kind, (state, obs) in starts.items():
-        b = bundle_of_state(state, obs, uv[ids], some)
-        best[kind] = polish(replace(b, X=b.X[pick]), sight)
-    # Tracks that make sense as points of one link, by every type if these are most of them.
+    for kind, start in starts.items():
+        b = start if isinstance(start, Bundle) else bundle_of_state(*start, some)
+        q = b.q[some] if len(b.q) > len(some) else b.q
+        best[kind] = polish(replace(b, X=b.X[pick], q=q - q[0]), sight)
+    # Tracks that make sense as points of one link, by every type if these are nearly all of them.
     sane = [compact(b.X) & (b.X[:, 2] > 0) for b in best.values()]
     keep = np.logical_and.reduce(sane)
-    if keep.sum() < max(MIN_COMMON, 0.5 * len(keep)):
+    if keep.sum() < max(MIN_COMMON, 0.8 * max(s.sum() for s in sane)):
         keep = sane[int(np.argmin([b.cost for b in best.values()]))]
     pick = pick[keep]
     sight = replace(sight, uv=sight.uv[keep], seen=sight.seen[keep], weight=sight.weight[keep])
@@ -130,11 +158,11 @@ def finish(starts: dict[str, tuple[State, Observations]], uv: np.ndarray, ids: n
     probability = type_probabilities(best, sight)
     kind = max(probability, key=lambda k: probability[k])
     b, members = best[kind], ids[pick]
-    more, X = followers(b, uv[:, some], np.setdiff1d(np.arange(len(uv)), members), sight)
+    more, X = followers(b, uv, np.setdiff1d(np.arange(len(uv)), members), view, sight)
     members = np.concatenate([members, more])
     b = replace(b, X=np.concatenate([b.X, X]))
     # The bundle adjustment keeps its bound; whatever is above it gets its point only.
-    sight = replace(sightings(uv[members][:, some], focal, focal_std, some), lasting=lasting)
+    sight = view.sightings(uv[members], some, lasting)
     sight = replace(sight, weight=shared_weights(rho, clusters(b)))
     bound = np.arange(len(members))
     if len(members) > MOST_TRACKS:
@@ -143,7 +171,7 @@ def finish(starts: dict[str, tuple[State, Observations]], uv: np.ndarray, ids: n
     last = polish(replace(b, X=b.X[bound]), few)
     sure = spread(last, few)
     b = place_points(replace(last, X=b.X), sight, rounds=3) if len(bound) < len(members) else last
-    every = replace(sightings(uv[members], focal, focal_std, np.arange(T)), weight=sight.weight, lasting=lasting)
+    every = replace(view.sightings(uv[members], np.arange(T), lasting), weight=sight.weight)
     if len(some) < T:
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
@@ -154,30 +182,32 @@ SURE = 20.0
 """Log-likelihood by which a further track has to prefer the joint's motion to standing still."""
 
 
-def followers(b: Bundle, uv: np.ndarray, ids: np.ndarray, like: Sightings, most: int = 800):
+def followers(
+    b: Bundle, uv: np.ndarray, ids: np.ndarray, view: View, like: Sightings, most: int = 800
+) -> tuple[np.ndarray, np.ndarray]:
     """Further tracks that move with the link, however little: those near the axis hold it best.
 
     Args:
-        b: the fitted joint.  uv: (N, T, 2) of all tracks in its frames.  ids: (m,) those to look at.
-        like: the fit's observations, for focal length, frames and noise.
+        b: the fitted joint.  uv: (N, T, 2) of all tracks.  ids: (m,) those to look at.
+        view: focal length and camera.  like: the fit's observations, for frames and noise.
 
     Returns:
         (k,) indices of the followers, and (k, 3) their points.
     """
     sigma = max(b.sigma, 0.05)
     extent = np.full(len(ids), 0.0)
-    some = np.isfinite(uv[ids, :, 0]).sum(1) >= 4
+    some = np.isfinite(uv[ids][:, like.frames, 0]).sum(1) >= 4
     extent[some] = np.linalg.norm(np.nanmax(uv[ids[some]], axis=1) - np.nanmin(uv[ids[some]], axis=1), axis=-1)
     ids = ids[extent > 8 * sigma]
     if not len(ids):
         return ids, np.zeros((0, 3))
     if len(ids) > most:
         ids = ids[np.linspace(0, len(ids) - 1, most).round().astype(int)]
-    s = sightings(uv[ids], like.focal, like.focal_std, like.frames)
+    s = view.sightings(uv[ids], like.frames, like.lasting)
     own = len(b.X)
     trial = place_points(replace(b, X=np.tile(np.median(b.X, axis=0), (len(ids), 1))), s)
     r = residuals(trial, s)
-    rest = np.where(s.seen[..., None], s.uv - np.nanmedian(uv[ids], axis=1)[:, None], 0.0)
+    rest = np.where(s.seen[..., None], s.uv - np.nanmedian(uv[ids][:, like.frames], axis=1)[:, None], 0.0)
     limit = ROBUST_SIGMAS * sigma
     cost = lambda e: np.sum(s.seen * limit**2 * (1 - limit**2 / (limit**2 + np.sum(e**2, axis=-1))), axis=1)  # noqa: E731
     gain = (cost(rest) - cost(r)) / (2 * sigma**2 * like.lasting)
@@ -185,11 +215,6 @@ def followers(b: Bundle, uv: np.ndarray, ids: np.ndarray, like: Sightings, most:
     good = (gain > SURE) & (size < 2.5 * sigma) & (trial.X[:, 2] > 0)
     good &= compact(np.concatenate([b.X, trial.X]))[own:]
     return ids[good], trial.X[good]
-
-
-def sightings(uv: np.ndarray, focal: float, focal_std: float, frames: np.ndarray) -> Sightings:
-    seen = np.isfinite(uv[..., 0])
-    return Sightings(np.where(seen[..., None], uv, 0.0), seen, np.ones(len(uv)), focal, focal_std, frames=frames)
 
 
 def _across_kinds(best: dict[str, Bundle]) -> dict[str, list[Bundle]]:
@@ -215,14 +240,21 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, f
     """Posterior of the types, from the curvature of the hinge and the advance of the screw."""
     hinge = best["revolute"]
     size = float(np.linalg.norm(np.quantile(hinge.X, 0.95, axis=0) - np.quantile(hinge.X, 0.05, axis=0)))
-    log = {"prismatic": 0.0, "revolute": log_odds_hinge(hinge.twist, spread(hinge, sight).curvature, size)}
+
+    def gain(one: Bundle, other: Bundle) -> float:
+        """Log-likelihood ratio where the noise's size is unknown: so many observations times half the logarithm."""
+        return one.cost / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
+
+    curvature = spread(hinge, sight).curvature
+    odds = log_odds_hinge(hinge.twist, curvature, size, gain(hinge, best["prismatic"]))
+    log = {"prismatic": 0.0, "revolute": odds}
     if "screw" in best:
         screw = best["screw"]
-        log["screw"] = log["revolute"] + log_odds_screw(screw.twist, spread(screw, sight).curvature)
+        log["screw"] = odds + log_odds_screw(screw.twist, spread(screw, sight).curvature, gain(screw, hinge))
     return probabilities(log)
 
 
-def compact(X: np.ndarray, reach: float = 5.0) -> np.ndarray:
+def compact(X: np.ndarray, reach: float = 8.0) -> np.ndarray:
     """(N,) bool: points near the others, within `reach` median absolute deviations in each principal direction.
 
     A stray track that the joint happens to explain is placed far in front of or behind the link.
@@ -233,8 +265,8 @@ def compact(X: np.ndarray, reach: float = 5.0) -> np.ndarray:
         _, _, vt = np.linalg.svd(Y[keep], full_matrices=False)
         P = np.abs(Y @ vt.T)
         scale = np.median(P[keep], axis=0)
-        # A plate is thin: its thickness is judged by its smaller side.
-        scale = np.maximum(scale, 0.15 * scale.max())
+        # A plate is thin, and points seen for a short while are placed badly in depth.
+        scale = np.maximum(scale, 0.5 * scale.max())
         now = (P < reach * scale).all(1)
         if now.sum() < 0.5 * len(X) or (now == keep).all():
             break

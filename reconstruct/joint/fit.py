@@ -9,8 +9,9 @@ import numpy as np
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
+from reconstruct.joint.cameras import camera_moves, joints_between, rigid_group
 from reconstruct.joint.evidence import bridged, free_motion
-from reconstruct.joint.finish import Finished, finish
+from reconstruct.joint.finish import Finished, View, finish
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
 from reconstruct.joint.select import explained, key_frames, motion_stretches, observations, search
@@ -20,7 +21,10 @@ from reconstruct.video import Video
 MOVING_SHARE = 0.012
 """A track moves if its extent exceeds this share of the image diagonal."""
 MIN_INLIERS = 8
-BRIDGED_SHARE, BRIDGED_ERROR = 0.5, 0.3
+SIMPLER = 1.05
+BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
+SCREW_TURN_DEG = 120.0
+"""Between two poses every rigid motion is a screw (Chasles): only a long one is evidence for a thread."""
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
 PRIOR_STD = 0.12
@@ -39,8 +43,9 @@ def fit_joint(
     focal_px: float | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
+    camera_moving: bool | None = None,
 ) -> JointFit:
-    """Joint type, axis, states and the moving link's points from tracks of one static camera.
+    """Joint type, axis, states and the moving link's points from tracks of one camera.
 
     Args:
         video: stabilised video (sizes, times; no pixel is read).
@@ -48,6 +53,8 @@ def fit_joint(
         focal_px: focal length in full px; the video's own or a typical one when None.
         seed: of the random subsets.
         progress: called with the done share.
+        camera_moving: whether the camera moves; judged from how many tracks keep their place when None. A moving one
+            is found together with the joint, from the static scene's tracks; the world is then up to the first camera.
 
     Returns:
         A JointFit up to scale (median depth of the link = 1), or one with verdict "refused".
@@ -60,8 +67,11 @@ def fit_joint(
     full = known or DEFAULT_FOCAL * max(video.size)
     camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
-    found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
     note = ""
+    view = View(camera.focal, 0.0 if known else PRIOR_STD)
+    if (camera_moving is None and camera_moves(uv, camera.diagonal)) or camera_moving:
+        return _moving_camera(video, uv - camera.centre, view, full, len(uv), seed)
+    found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
         stretches = motion_stretches(uv[_moving(uv, camera)], video.time)
@@ -76,9 +86,9 @@ def fit_joint(
         return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members))
     tell(0.9)
 
-    done = finish(found.starts, uv - camera.centre, found.members, camera.focal, 0.0 if known else PRIOR_STD)
+    done = finish(found.starts, uv - camera.centre, found.members, view)
     tell(1.0)
-    if reason := _why_not_bridged(done):
+    if reason := _why_not_believed(done):
         return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
 
@@ -135,7 +145,9 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
         best.setdefault(s.kind, s)
     if not best:
         return _Consensus(refusal="no tracks move together for long enough to draw a joint", scattered=True)
-    s = max(best.values(), key=lambda s: explained(s, obs)[0])
+    # The hinge contains the slide: it has to explain clearly more to name the tracks of the link.
+    worth = {kind: explained(s, obs)[0] * (SIMPLER if kind == "prismatic" else 1.0) for kind, s in best.items()}
+    s = best[max(worth, key=lambda kind: worth[kind])]
 
     # All moving tracks, not just the sample of the search, for the consensus set.
     every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
@@ -176,7 +188,32 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     return None
 
 
-def _why_not_bridged(done: Finished) -> str | None:
+def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, tracks: int, seed: int) -> JointFit:
+    """The joint between the two largest rigid groups of tracks (N, T, 2), px from the principal point."""
+    everything = np.ones(len(uv), bool)
+    static = rigid_group(uv, view.focal, everything, seed)
+    if static is None:
+        return JointFit("refused", "the camera moves, and too few points of a static scene are followed", tracks=tracks)
+    link = rigid_group(uv, view.focal, ~static.members, seed)
+    if link is None:
+        return JointFit("refused", "the camera moves and nothing else: no second rigid group of tracks", tracks=tracks)
+    starts = joints_between(static, link)
+    view = View(view.focal, 0.0, static.R, static.t)
+    done = finish(starts, uv, np.flatnonzero(link.members), view)
+    if reason := _why_not_believed(done):
+        return JointFit("refused", reason, tracks=tracks, inliers=len(done.members))
+    note = f"; the camera moves: its path is fitted to {int(static.members.sum())} static tracks"
+    return _result(video, done, full_focal, tracks, note, KNOWN_STD)
+
+
+def _why_not_believed(done: Finished) -> str | None:
+    """A sentence if the finished joint is not one."""
+    turn = np.degrees(np.ptp(done.bundle.q) * np.linalg.norm(done.bundle.twist.curvature))
+    if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
+        return (
+            f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any body does "
+            f"that is carried a short way; a screw is believed from {SCREW_TURN_DEG:.0f} deg on"
+        )
     b = bridged(done.bundle, done.sight)
     if b.supported < BRIDGED_SHARE:
         return f"too few tracks last through the motion: {1 - b.supported:.0%} of the stroke is seen by hardly any"

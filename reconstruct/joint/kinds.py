@@ -2,7 +2,7 @@
 
 The slide is the hinge whose curvature w is zero. With the likelihood of w from the bundle adjustment (Gaussian, with
 the robust covariance) and a prior of where hinges are, the odds are the Savage-Dickey ratio
-(Dickey, 1971): the marginal likelihood with w free over that with w = 0. The screw against the hinge is the same
+(Dickey, 1971): the marginal likelihood with w free over that with w = 0, whose peak is the robust costs' difference. The screw against the hinge is the same
 question about w's part along the direction of motion.
 """
 
@@ -13,17 +13,18 @@ import numpy as np
 from reconstruct.joint.twist import Twist
 
 PRIOR = {"revolute": 0.6, "prismatic": 0.37, "screw": 0.03}
-HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.6
+HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.5
 """Median distance of a hinge from the link's middle over the link's size, and the standard deviation of its logarithm.
 The hinges of simulated furniture lie 0.34 to 0.64 link diagonals away (knobs less); texture on a part of the link only
 makes it look smaller."""
 
 
-def log_odds_hinge(twist: Twist, covariance: np.ndarray, size: float) -> float:
+def log_odds_hinge(twist: Twist, covariance: np.ndarray, size: float, gain: float) -> float:
     """Logarithm of the Bayes factor of a hinge against a slide.
 
     Args:
         twist: of the hinge.  covariance: (3, 3) of its curvature.  size: of the link, in the twist's units.
+        gain: log-likelihood at its best over the slide's at its best.
     """
     basis = _across(twist)
     w = basis.T @ twist.curvature
@@ -45,15 +46,19 @@ def log_odds_hinge(twist: Twist, covariance: np.ndarray, size: float) -> float:
     density = -0.5 * zw**2 - np.log(np.sqrt(2 * np.pi) * HINGE_SPREAD) - np.log(2 * np.pi * max(k, 1e-12) ** 2)
     laplace = float(density + np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(P)[1])
     sharp = np.sqrt(1.0 / np.linalg.eigvalsh(P)[-1]) < 0.1 * k
-    return (laplace if sharp else grid) + 0.5 * float(w @ P @ w)
+    return (laplace if sharp else grid) + gain
 
 
 SCREW_ADVANCE = (0.08, 0.8)
 """Advance of a screw over its path: a hinge whose fit creeps by less along its axis is a hinge."""
 
 
-def log_odds_screw(twist: Twist, covariance: np.ndarray) -> float:
-    """Logarithm of the Bayes factor of a screw against a hinge: advance uniform in SCREW_ADVANCE, of either sign."""
+def log_odds_screw(twist: Twist, covariance: np.ndarray, gain: float) -> float:
+    """Logarithm of the Bayes factor of a screw against a hinge: advance uniform in SCREW_ADVANCE, of either sign.
+
+    Args:
+        twist, covariance: of the screw and its curvature.  gain: log-likelihood at its best over the hinge's.
+    """
     d = twist.direction
     k = np.linalg.norm(twist.curvature)
     if k <= 0:
@@ -64,7 +69,7 @@ def log_odds_screw(twist: Twist, covariance: np.ndarray) -> float:
     x = np.linspace(lo, hi, 400)
     log = np.concatenate([-0.5 * ((x - share) / std) ** 2, -0.5 * ((x + share) / std) ** 2])
     top = log.max()
-    return float(top + np.log(np.exp(log - top).mean()) + 0.5 * (share / std) ** 2)
+    return float(top + np.log(np.exp(log - top).mean()) + gain)
 
 
 def probabilities(log_odds: dict[str, float]) -> dict[str, float]:

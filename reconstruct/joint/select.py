@@ -109,7 +109,7 @@ def coherence(uv: np.ndarray) -> np.ndarray:
     return np.clip(2 * extent / np.maximum(path, 1e-6), 0, 1) ** 2
 
 
-def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int = 6) -> list[Hypothesis]:
+def window_hypotheses(obs: Observations, rng: np.random.Generator, windows: int = 10) -> list[Hypothesis]:
     """Hypotheses from windows around several reference key frames, both directions of time."""
     K = len(obs.frames)
     found: list[Hypothesis] = _global_hypotheses(obs, rng)
@@ -321,7 +321,7 @@ wider search."""
 def search(
     obs: Observations,
     rng: np.random.Generator,
-    coarse: int = 40,
+    coarse: int = 60,
     fine: int = 10,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[State]:
