@@ -155,27 +155,33 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View) -> Finis
     sight = replace(sight, weight=shared_weights(rho, clusters(lead)), lasting=lasting)
     for kind, b in _across_kinds(best).items():
         best[kind] = min((polish(b, sight) for b in b), key=lambda b: b.cost)
-    probability = type_probabilities(best, sight)
-    kind = max(probability, key=lambda k: probability[k])
-    b, members = best[kind], ids[pick]
-    more, X = followers(b, uv, np.setdiff1d(np.arange(len(uv)), members), view, sight)
-    members = np.concatenate([members, more])
-    b = replace(b, X=np.concatenate([b.X, X]))
-    # The bundle adjustment keeps its bound; whatever is above it gets its point only.
-    sight = view.sightings(uv[members], some, lasting)
-    sight = replace(sight, weight=shared_weights(rho, clusters(b)))
+    lead = best[_winner(type_probabilities(best, sight))]
+    # Now that the motion is known, whatever follows it joins in, and the types are weighed on all of it.
+    members = ids[pick]
+    more, X = followers(lead, uv, np.setdiff1d(np.arange(len(uv)), members), view, sight)
+    members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
+    weight = shared_weights(rho, clusters(replace(lead, X=X)))
+    sight = replace(view.sightings(uv[members], some, lasting), weight=weight)
     bound = np.arange(len(members))
     if len(members) > MOST_TRACKS:
         bound = np.linspace(0, len(members) - 1, MOST_TRACKS).round().astype(int)
-    few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=sight.weight[bound])
-    last = polish(replace(b, X=b.X[bound]), few)
+    few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=weight[bound])
+    for kind, b in best.items():
+        start = replace(b, X=X[bound])
+        best[kind] = polish(start if b is lead else place_points(start, few), few, iterations=30)
+    probability = type_probabilities(best, few)
+    last = best[_winner(probability)]
     sure = spread(last, few)
-    b = place_points(replace(last, X=b.X), sight, rounds=3) if len(bound) < len(members) else last
+    b = place_points(replace(last, X=X), sight, rounds=4) if len(bound) < len(members) else last
     every = replace(view.sightings(uv[members], np.arange(T), lasting), weight=sight.weight)
     if len(some) < T:
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
     return Finished(b, every, members, sure, probability, rho, lasting)
+
+
+def _winner(probability: dict[str, float]) -> str:
+    return max(probability, key=lambda k: probability[k])
 
 
 SURE = 20.0
@@ -243,7 +249,8 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, f
 
     def gain(one: Bundle, other: Bundle) -> float:
         """Log-likelihood ratio where the noise's size is unknown: so many observations times half the logarithm."""
-        return one.cost / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
+        count = one.cost / (2 * one.sigma**2 * sight.lasting)
+        return float(count * np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
 
     curvature = spread(hinge, sight).curvature
     odds = log_odds_hinge(hinge.twist, curvature, size, gain(hinge, best["prismatic"]))
@@ -254,24 +261,16 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, f
     return probabilities(log)
 
 
-def compact(X: np.ndarray, reach: float = 8.0) -> np.ndarray:
-    """(N,) bool: points near the others, within `reach` median absolute deviations in each principal direction.
+def compact(X: np.ndarray, reach: float = 2.5) -> np.ndarray:
+    """(N,) bool: points within `reach` link sizes of the link's middle.
 
-    A stray track that the joint happens to explain is placed far in front of or behind the link.
+    A stray track that the joint happens to explain is placed far in front of or behind the link; the link's size is
+    read across the line of sight, where strays count as everything else.
     """
-    keep = np.ones(len(X), bool)
-    for _ in range(3):
-        Y = X - np.median(X[keep], axis=0)
-        _, _, vt = np.linalg.svd(Y[keep], full_matrices=False)
-        P = np.abs(Y @ vt.T)
-        scale = np.median(P[keep], axis=0)
-        # A plate is thin, and points seen for a short while are placed badly in depth.
-        scale = np.maximum(scale, 0.5 * scale.max())
-        now = (P < reach * scale).all(1)
-        if now.sum() < 0.5 * len(X) or (now == keep).all():
-            break
-        keep = now
-    return keep
+    middle = np.median(X, axis=0)
+    across = X[:, :2] / np.maximum(X[:, 2:], 1e-3) * middle[2]
+    size = float(np.linalg.norm(np.quantile(across, 0.9, axis=0) - np.quantile(across, 0.1, axis=0)))
+    return np.linalg.norm(X - middle, axis=1) < reach * max(size, 1e-6)
 
 
 def states_of_all_frames(b: Bundle, s: Sightings, some: np.ndarray) -> Bundle:

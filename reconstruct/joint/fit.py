@@ -211,8 +211,8 @@ def _why_not_believed(done: Finished) -> str | None:
     turn = np.degrees(np.ptp(done.bundle.q) * np.linalg.norm(done.bundle.twist.curvature))
     if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
         return (
-            f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any body does "
-            f"that is carried a short way; a screw is believed from {SCREW_TURN_DEG:.0f} deg on"
+            f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any "
+            f"body does that is carried a short way; a screw is believed from {SCREW_TURN_DEG:.0f} deg on"
         )
     b = bridged(done.bundle, done.sight)
     if b.supported < BRIDGED_SHARE:

@@ -1,9 +1,9 @@
 """Which type: the hinge contains the slide and the screw contains both, so the question is what the curvature is.
 
-The slide is the hinge whose curvature w is zero. With the likelihood of w from the bundle adjustment (Gaussian, with
-the robust covariance) and a prior of where hinges are, the odds are the Savage-Dickey ratio
-(Dickey, 1971): the marginal likelihood with w free over that with w = 0, whose peak is the robust costs' difference. The screw against the hinge is the same
-question about w's part along the direction of motion.
+The slide is the hinge whose curvature w is zero. The odds are the ratio of the marginal likelihood with w free, over a
+prior of where hinges are, to that with w = 0 (compare Dickey, 1971): the peak comes from the robust costs, the width
+from the covariance of the bundle adjustment. The screw against the hinge is the same question about w's part along the
+direction of motion.
 """
 
 from __future__ import annotations
