@@ -314,7 +314,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
 
     def find() -> JointFit:
         if not ranged:
-            return fit_joint(video, tracks, focal, seed, stages.progress.update)
+            return fit_joint(video, tracks, focal, seed, stages.progress.update, camera_moving=False)
         depth, metric = None, bool(camera.get("metric", np.array(True)))
         if "xyz_world" not in tracks_cue:
             cue = folder.read("depth", "depth")

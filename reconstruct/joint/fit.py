@@ -69,8 +69,11 @@ def fit_joint(
 
     note = ""
     view = View(camera.focal, 0.0 if known else PRIOR_STD)
-    if (camera_moving is None and camera_moves(uv, camera.diagonal)) or camera_moving:
-        return _moving_camera(video, uv - camera.centre, view, full, len(uv), seed)
+    if camera_moving or (camera_moving is None and camera_moves(uv, camera.diagonal)):
+        fit = _moving_camera(video, uv - camera.centre, view, full, len(uv), seed)
+        # Tracks on nothing but the part look like a moving camera too: then there is one rigid group only.
+        if camera_moving or fit.verdict != "refused":
+            return fit
     found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
