@@ -68,15 +68,7 @@ def test_demo_clip_from_its_pixels_alone(tmp_path):
         env.close()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "still",
-        pytest.param(
-            "lift", marks=pytest.mark.xfail(reason="a parcel that is lifted almost straight passes for a slide")
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", ["still", "lift"])
 def test_rendered_clip_without_a_joint_is_refused(name, tmp_path):
     row = run(name, tmp_path)
     assert row["verdict"] == "refused", row

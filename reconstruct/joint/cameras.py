@@ -16,7 +16,7 @@ from reconstruct.joint.polish import Bundle
 from reconstruct.joint.twist import Twist, skew, twist_of_joint
 
 MIN_GROUP = 15
-STILL_SHARE = 0.05
+STILL_SHARE = 0.15
 """A camera moves if fewer tracks than this share stay where they are."""
 
 
@@ -44,7 +44,7 @@ def camera_moves(uv: np.ndarray, diagonal: float) -> bool:
     if len(long) < 2 * MIN_GROUP:
         return False
     low, high = np.nanquantile(uv[long], [0.05, 0.95], axis=1)
-    return bool(np.mean(np.linalg.norm(high - low, axis=-1) < 0.006 * diagonal) < STILL_SHARE)
+    return bool(np.mean(np.linalg.norm(high - low, axis=-1) < 0.004 * diagonal) < STILL_SHARE)
 
 
 def rigid_group(uv: np.ndarray, focal: float, candidates: np.ndarray, seed: int = 0) -> Rigid | None:
@@ -138,7 +138,7 @@ def _triangulated(x: np.ndarray, seen: np.ndarray, poses: list, X: np.ndarray) -
             w = np.where(seen[:, k], 1.0, 0.0)
             if sweep:
                 err = np.linalg.norm((X @ R[:2].T + t[:2]) / np.maximum(z, 1e-3)[:, None] - x[:, k], axis=-1)
-                w = w / np.maximum(z, 1e-2) ** 2 / (1 + (np.nan_to_num(err) / 0.004) ** 2) ** 2
+                w = w / np.maximum(z, 1e-2) ** 2 / (1 + (np.clip(np.nan_to_num(err), 0, 1e3) / 0.004) ** 2) ** 2
             for axis in range(2):
                 row = np.nan_to_num(x[:, k, axis])[:, None] * R[2] - R[axis]
                 rhs = t[axis] - np.nan_to_num(x[:, k, axis]) * t[2]

@@ -23,6 +23,7 @@ MOVING_SHARE = 0.012
 MIN_INLIERS = 8
 SIMPLER = 1.05
 BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
+NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 SCREW_TURN_DEG = 120.0
 """Between two poses every rigid motion is a screw (Chasles): only a long one is evidence for a thread."""
 DEFAULT_FOCAL = 0.8
@@ -71,9 +72,9 @@ def fit_joint(
     view = View(camera.focal, 0.0 if known else PRIOR_STD)
     if camera_moving or (camera_moving is None and camera_moves(uv, camera.diagonal)):
         fit = _moving_camera(video, uv - camera.centre, view, full, len(uv), seed)
-        # Tracks on nothing but the part look like a moving camera too: then there is one rigid group only.
-        if camera_moving or fit.verdict != "refused":
-            return fit
+        # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
+        if camera_moving or fit is not None:
+            return fit or JointFit("refused", NO_SCENE, tracks=len(uv))
     found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
@@ -192,11 +193,14 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
 
 
 def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, tracks: int, seed: int) -> JointFit:
-    """The joint between the two largest rigid groups of tracks (N, T, 2), px from the principal point."""
+    """The joint between the two largest rigid groups of tracks (N, T, 2), px from the principal point.
+
+    None if there is no group, or nothing beside it.
+    """
     everything = np.ones(len(uv), bool)
     static = rigid_group(uv, view.focal, everything, seed)
-    if static is None:
-        return JointFit("refused", "the camera moves, and too few points of a static scene are followed", tracks=tracks)
+    if static is None or static.members.mean() > 0.9:
+        return None
     link = rigid_group(uv, view.focal, ~static.members, seed)
     if link is None:
         return JointFit("refused", "the camera moves and nothing else: no second rigid group of tracks", tracks=tracks)

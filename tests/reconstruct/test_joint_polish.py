@@ -1,0 +1,122 @@
+"""The twist family and its bundle adjustment: derivatives, the noise's own bound, and which type."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reconstruct.joint.finish import compact, type_probabilities
+from reconstruct.joint.models import joint_transform
+from reconstruct.joint.polish import Bundle, Sightings, normal_equations, place_points, polish, positions, residuals
+from reconstruct.joint.twist import Twist, twist_of_joint
+from reconstruct.joint.uncertainty import lasting_error, shared_error, spread
+
+FOCAL, SIGMA = 700.0, 0.5
+number = st.floats(-2, 2)
+
+
+def scene(kind, seed=0, points=60, frames=40, stroke=0.8, noise=SIGMA):
+    """A link seen by a static camera, its truth as a bundle, and its sightings."""
+    rng = np.random.default_rng(seed)
+    axis = np.array([0.2, 1.0, 0.3]) / np.linalg.norm([0.2, 1.0, 0.3])
+    point = np.array([-0.3, 0.0, 1.6])
+    X = point + rng.uniform([0.05, -0.3, -0.05], [0.5, 0.3, 0.05], (points, 3))
+    twist, speed = twist_of_joint(kind, axis, None if kind == "prismatic" else point, X.mean(0))
+    q = stroke * np.sin(np.linspace(0, np.pi / 2, frames)) * speed
+    truth = Bundle(kind, twist, q, X, sigma=noise)
+    blank = Sightings(np.zeros((points, frames, 2)), np.ones((points, frames), bool), np.ones(points), FOCAL)
+    uv = residuals(truth, blank) + rng.normal(scale=noise, size=(points, frames, 2))
+    return truth, replace(blank, uv=uv)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(["revolute", "prismatic"]), number, number, st.floats(-2.5, 2.5))
+def test_a_twist_moves_points_as_the_joint_does(kind, x, y, q):
+    axis, point, anchor = np.array([0.6, 0.0, 0.8]), np.array([0.1, -0.4, 1.0]), np.array([0.5, 0.5, 1.5])
+    twist, speed = twist_of_joint(kind, axis, point, anchor)
+    R, p = twist.pose(np.array([q * speed]))
+    moved = anchor + R[0] @ (np.array([x, y, 1.0]) - anchor) + p[0]
+    T = joint_transform(kind, axis, point, q)
+    np.testing.assert_allclose(moved, T[:3, :3] @ [x, y, 1.0] + T[:3, 3], atol=1e-9)
+
+
+def test_a_far_hinge_becomes_a_slide_smoothly():
+    anchor, q = np.array([0.0, 0.0, 1.0]), np.linspace(-0.5, 0.5, 7)
+    slide = Twist(anchor, np.array([1.0, 0, 0]), np.zeros(3)).pose(q)[1]
+    for k in (1e-3, 1e-6, 1e-9):
+        hinge = Twist(anchor, np.array([1.0, 0, 0]), np.array([0, 0, k])).pose(q)[1]
+        assert np.abs(hinge - slide).max() <= 0.2 * k
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic", "screw"])
+def test_derivatives_of_the_bundle_adjustment(kind):
+    truth, s = scene("revolute" if kind == "screw" else kind)
+    b = replace(truth, kind=kind)
+    world, cam = positions(b, s)
+    r = residuals(b, s, cam)
+    n = normal_equations(b, s, world, cam, r, s.seen.astype(float))
+    G, h = n.Z.shape[1], 1e-6
+    cost = lambda b: 0.5 * np.sum(residuals(b, s) ** 2)  # noqa: E731
+    for k in range(G):
+        up, down = (replace(b, twist=b.twist.moved(sign * h * n.Z[:, k], kind)) for sign in (1, -1))
+        assert (cost(up) - cost(down)) / (2 * h) == pytest.approx(n.g[k], rel=1e-3, abs=0.1)
+    step = np.zeros(len(b.q))
+    step[7] = h
+    slope = (cost(replace(b, q=b.q + step)) - cost(replace(b, q=b.q - step))) / (2 * h)
+    assert slope == pytest.approx(n.g[G + 7], rel=1e-3, abs=0.1)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_error_is_that_of_the_noise_and_stated_as_such(kind):
+    ratio, stated = [], []
+    for seed in range(8):
+        truth, s = scene(kind, seed)
+        rng = np.random.default_rng(seed)
+        start = replace(truth, X=truth.X * rng.uniform(0.95, 1.05, (len(truth.X), 1)),
+                        twist=truth.twist.moved(rng.normal(scale=0.05, size=6), kind))  # fmt: skip
+        fit = polish(start, s, iterations=30)
+        error = np.degrees(np.arccos(min(1.0, abs(fit.twist.axis @ truth.twist.axis))))
+        stated.append(spread(fit, s).axis_deg)
+        ratio.append(error / spread(truth, s).axis_deg)
+        assert fit.sigma == pytest.approx(SIGMA, rel=0.1)
+    assert np.sqrt(np.mean(np.square(ratio))) < 1.5
+    assert np.mean(np.array(ratio) < 2) >= 0.85
+    assert np.mean(stated) == pytest.approx(np.mean([spread(*scene(kind, k)).axis_deg for k in range(8)]), rel=0.3)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_type_from_one_family(kind):
+    truth, s = scene(kind, 3)
+    bent = replace(truth.twist, curvature=np.array([0.0, 0.2, 0.0]))
+    others = {
+        "revolute": replace(truth, kind="revolute", twist=bent.moved(np.zeros(6), "revolute")),
+        "prismatic": replace(truth, kind="prismatic", twist=truth.twist.moved(np.zeros(6), "prismatic")),
+        "screw": replace(truth, kind="screw", twist=bent),
+    }
+    best = {k: polish(truth if k == kind else b, s, iterations=40) for k, b in others.items()}
+    p = type_probabilities(best, s)
+    assert p[kind] > 0.9
+    assert sum(p.values()) == pytest.approx(1)
+
+
+def test_lasting_and_shared_errors_are_measured():
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(40, 80, 2))
+    seen, cluster = np.ones((40, 80), bool), np.arange(40) // 4
+    assert lasting_error(white, seen) < 1.5
+    assert shared_error(white, seen, cluster) < 0.05
+    slow = np.repeat(rng.normal(size=(40, 8, 2)), 10, axis=1)
+    assert lasting_error(slow, seen) > 5
+    together = white + 2 * np.repeat(rng.normal(size=(10, 80, 2)), 4, axis=0)
+    assert shared_error(together, seen, cluster) > 0.6
+
+
+def test_points_find_their_place_and_strays_are_told_apart():
+    truth, s = scene("revolute", 5)
+    lost = replace(truth, X=np.tile(np.median(truth.X, axis=0), (len(truth.X), 1)))
+    found = place_points(lost, s)
+    assert np.median(np.linalg.norm(found.X - truth.X, axis=1)) < 0.02
+    X = np.concatenate([truth.X, truth.X[:3] * 4])
+    assert compact(X).tolist() == [True] * len(truth.X) + [False] * 3
