@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -317,8 +318,8 @@ def test_meshes_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_a_mesh_that_cuts_through_itself_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fuzzer's: a box with corners moved through its faces, on which the decomposition does not end."""
+def test_a_mesh_that_cuts_through_itself_is_cut_or_given_up_in_time() -> None:
+    """The fuzzer's: a box with corners moved through its faces, on which the decomposition may run for ever."""
     from reconstruct.geometry.given import bounded_parts
 
     corners = (
@@ -343,8 +344,15 @@ def test_a_mesh_that_cuts_through_itself_is_given_up(monkeypatch: pytest.MonkeyP
             [7, 5, 6],
         ]
     )
-    with pytest.raises(TaaError, match="convex parts"):
-        bounded_parts(corners, faces, seconds=8.0)
+    # Whether it ends depends on the build of the decomposition and its threads; that somebody waits for it must not.
+    with pytest.raises(TaaError, match="convex parts within"):
+        bounded_parts(corners, faces, seconds=0.05)
+    begin = time.monotonic()
+    try:
+        assert len(bounded_parts(corners, faces, seconds=8.0)) >= 1
+    except TaaError as error:
+        assert "convex parts" in str(error)
+    assert time.monotonic() - begin < 60
     box = trimesh.creation.box()
     ((vertices, _),) = bounded_parts(np.asarray(box.vertices), np.asarray(box.faces))
     assert len(vertices) == 8
