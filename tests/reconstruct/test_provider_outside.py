@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
@@ -172,5 +173,9 @@ def test_the_other_environment_sees_nothing_of_this_one(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/somewhere/of/ours")
     script = tmp_path / "repository" / "run.py"
     script.parent.mkdir()
-    script.write_text("import os, sys\nassert 'PYTHONPATH' not in os.environ\nassert sys.argv[1:] == ['a', 'b c']\n")
+    seen = tmp_path / "seen.json"
+    script.write_text(
+        f"import json, os, sys\njson.dump(['PYTHONPATH' in os.environ, sys.argv[1:]], open({str(seen)!r}, 'w'))\n"
+    )
     run_script("x", {"python": sys.executable, "args": ["b c"]}, script, ["a"], tmp_path / "log.txt")
+    assert json.loads(seen.read_text()) == [False, ["a", "b c"]]
