@@ -10,18 +10,8 @@ contract, at the end of the replay:
                         (from that frame to the next) the hand pushed on the moving link; 0 where the reference has none
 ``max_penetration_m``   deepest overlap of hand and moving link
 ``wrong_way``           largest motion against the demonstration's direction, as a fraction of its stroke
-``controls``            ``joint_progress`` of three replays that must not succeed:
-
-- *no_hand*: the same time without a hand. Finds objects that move by themselves.
-- *mirrored_hand*: the hand reflected, at every time, in the fixed plane in which the link lies when the demonstration
-  starts: through the axis and the link's centre of mass (revolute; through the hand instead of the centre of mass where
-  that lies on the axis), or square to the axis through the centre of mass (prismatic). Reflection turns the
-  demonstrated motion about: the hand is as near to the link, on its other side, and moves the wrong way. Finds joints
-  that answer to a hand's presence rather than to its push.
-- *late_hand*: the hand motion delayed by the replay's own length, so that the hand waits where the video began while
-  the demonstrated motion would take place. Finds joints that move by the clock, and first poses whose overlap of hand
-  and link alone pushes. (A delay that ended with the hand at the link would measure how hard a waiting hand leans on
-  it, which on a stroke of millimetres is no small part.)
+``controls``            ``joint_progress`` of three replays that must not succeed: without a hand, with
+                        a mirrored one, with a late one; see :mod:`taa_envs.controls`
 """
 
 from __future__ import annotations
@@ -32,13 +22,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taa_envs.asset import Asset
+from taa_envs.controls import CONTROLS, HOLD, control_path
 from taa_envs.hands import Hand, make_hand
 from taa_envs.hands.rig import JointedController
 from taa_envs.scene import Scene, build_scene
 from taa_envs.simulation import Diverged, HandPath, Simulation, Step
-
-CONTROLS = ("no_hand", "mirrored_hand", "late_hand")
-HOLD = 0.2  # s for which the hand stays at its last pose: time for what it pushes to catch up
 
 
 @dataclass(frozen=True)
@@ -87,51 +75,6 @@ class ReplayResult:
                 "max_progress": self.max_progress, "contact_fraction": self.contact_fraction,
                 "max_penetration_m": self.max_penetration_m, "wrong_way": self.wrong_way,
                 "controls": dict(self.controls)}
-
-
-def mirror_plane(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Point (3,) m and unit normal (3,) of the plane in which the mirrored control reflects the hand."""
-    import mujoco
-
-    asset = scene.asset
-    data = mujoco.MjData(scene.model)
-    data.qpos[scene.qpos] = asset.demo["q_start"]
-    mujoco.mj_kinematics(scene.model, data)
-    mujoco.mj_comPos(scene.model, data)
-    centre = data.xipos[scene.model.body("moving").id].copy()
-    axis = np.array(asset.joint["axis"], float)
-    axis /= np.linalg.norm(axis)
-    if asset.joint_type == "prismatic":
-        return centre, axis
-    point = np.array(asset.joint["point"], float)
-
-    def from_axis(x: np.ndarray) -> np.ndarray:
-        return (x - point) - ((x - point) @ axis) * axis
-
-    arm = from_axis(centre)
-    if np.linalg.norm(arm) < 0.05 * scene.size:  # a knob: its centre of mass names no side
-        reference = asset.reference
-        first = int(np.argmax(reference.contact)) if reference.contact.any() else 0
-        arm = from_axis(reference.hand_joints[first].mean(0))
-    normal = np.cross(axis, arm)
-    length = np.linalg.norm(normal)
-    if length < 1e-9:
-        normal, length = np.linalg.svd(axis[None])[2][1], 1.0
-    return point, normal / length
-
-
-def control_path(scene: Scene, name: str) -> HandPath | None:
-    """The hand of a control ("no_hand", "mirrored_hand", "late_hand"), see the module's text; None for no hand."""
-    asset, reference = scene.asset, scene.asset.reference
-    if name == "no_hand":
-        return None
-    if name == "mirrored_hand":
-        point, normal = mirror_plane(scene)
-        away = (reference.hand_joints - point) @ normal
-        return HandPath(reference.time, reference.hand_joints - 2 * away[..., None] * normal)
-    if name == "late_hand":
-        return HandPath(reference.time + asset.end_time + HOLD - reference.time[0], reference.hand_joints)
-    raise ValueError(f"no control is named {name!r}; known: {', '.join(CONTROLS)}")
 
 
 def simulate(scene: Scene, path: HandPath | None) -> Trajectory:
@@ -205,7 +148,7 @@ def replay(asset: Asset, hand: str | Hand = "points", *, controls: bool = True, 
             # In a mirror a right hand is a left one, and only a left one can do what it does there.
             other = "left" if scene.hand.hand.skeleton.side == "right" else "right"
             control_scene = build_scene(asset, make_hand(scene.hand.hand.name, other), touch_static=touch_static)
-        progress[name] = float(asset.progress(simulate(control_scene, control_path(scene, name)).q[-1]))
+        progress[name] = float(asset.progress(simulate(control_scene, control_path(control_scene, name)).q[-1]))
     fractions = asset.stroke_fraction(np.array(run.q_extremes))
     return ReplayResult(
         joint_progress=float(asset.progress(run.q[-1])), final_q_error=asset.final_q_error(run.q[-1]),
@@ -243,5 +186,4 @@ def render_frames(asset: Asset, trajectory: Trajectory, *, hand: str | Hand | No
             yield renderer.render().copy()
 
 
-__all__ = ["CONTROLS", "Diverged", "ReplayResult", "Trajectory", "control_path", "mirror_plane", "render_frames",
-           "replay", "simulate"]
+__all__ = ["CONTROLS", "Diverged", "ReplayResult", "Trajectory", "render_frames", "replay", "simulate"]

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from taa_envs.controls import HOLD
 from taa_envs.hands.rig import JointedController
-from taa_envs.replay import HOLD
 from taa_envs.rows import BatchRows, hand_rows
 from taa_envs.scene import Scene, decode_touch, touch_columns
 from taa_envs.simulation import HandPath

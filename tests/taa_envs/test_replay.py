@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 
 from taa_envs.asset import Asset, save_asset
-from taa_envs.replay import CONTROLS, HOLD, ReplayResult, control_path, mirror_plane, render_frames, replay, simulate
+from taa_envs.controls import CONTROLS, HOLD, control_path, mirror_plane
+from taa_envs.replay import ReplayResult, render_frames, replay, simulate
 from taa_envs.scene import build_scene
-from taa_envs.simulation import HandPath, Simulation
-from tests.taa_envs.made import door_arguments, drawer_arguments
+from taa_envs.simulation import HandPath, Simulation, Step
+from tests.taa_envs.made import door_arguments, drawer_arguments, min_jerk
 
 NAMES = ("door", "pushed_door", "drawer")
 
@@ -96,9 +98,84 @@ def test_mirror_reverses_the_hands_motion(door: Asset, drawer: Asset) -> None:
         if asset.joint_type == "revolute":
             assert abs(normal @ np.array(asset.joint["axis"])) < 1e-9
         path = control_path(scene, "mirrored_hand")
-        moved = asset.reference.hand_joints[-1].mean(0) - asset.reference.hand_joints[20].mean(0)
-        mirrored = path.joints[-1].mean(0) - path.joints[20].mean(0)
-        assert (moved @ normal) == pytest.approx(-(mirrored @ normal)) and abs(moved @ normal) > 0.1
+        reference = asset.reference
+        driven = np.flatnonzero(reference.contact)
+        for frame in driven[[0, len(driven) // 2, -1]]:
+            hand = reference.hand_joints[frame]
+            reflected = hand - 2 * ((hand - point) @ normal)[:, None] * normal
+            np.testing.assert_allclose(path.at(float(reference.time[frame])), reflected, atol=1e-9)
+
+
+def turning(asset: Asset, path: HandPath, times: np.ndarray) -> np.ndarray:
+    """Mean of the joint's motion (rad or m) that the hand's own motion between the times amounts to."""
+    axis = np.array(asset.joint["axis"], float)
+    joints = np.stack([path.at(float(t)) for t in times])
+    step = np.diff(joints, axis=0)
+    if asset.joint_type == "prismatic":
+        return (step @ axis).mean(1)
+    arm = joints[:-1] - asset.joint["point"]
+    along = np.cross(axis, arm)
+    return ((step * along).sum(-1) / (along**2).sum(-1)).mean(1)
+
+
+def test_a_mirrored_hand_moves_against_the_demonstration_all_the_time(door: Asset, drawer: Asset) -> None:
+    for asset in (door, drawer):
+        scene = build_scene(asset)
+        path = control_path(scene, "mirrored_hand")
+        times = np.arange(path.time[0], asset.end_time, 0.01)
+        moved = turning(asset, path, times)
+        assert moved.max() < 1e-9 and moved.sum() < -abs(asset.demo["q_demo_end"])
+        sim = Simulation(scene)
+        sim.reset(asset.demo["q_start"], path.joints[0])
+        assert sim.data.ncon == 0, "it begins clear of the link"
+
+
+def pressed_shut(folder: Path) -> Asset:
+    """The door, whose hand first rests on it and presses it shut, lets go, and then pulls the handle."""
+    arguments = door_arguments()
+    reference = arguments["reference"]
+    flat = reference["hand_joints"][18] * [1, 0, 1] + [-0.1, 0.002, 0.0]
+    steps = min_jerk(np.linspace(0, 1, 10))[:, None, None]
+    leaving = flat + steps * [0.0, 0.15, 0.0]
+    over = leaving[-1] + steps * (reference["hand_joints"][0] - leaving[-1])
+    before = np.concatenate([np.repeat(flat[None], 20, 0), leaving, over])
+    n = len(before)
+    reference["hand_joints"] = np.concatenate([before, reference["hand_joints"]])
+    for name in ("q", "hand_valid", "contact"):
+        old = reference[name]
+        reference[name] = np.concatenate([np.full(n, name == "hand_valid", old.dtype), old])
+    reference["time"] = np.arange(len(reference["q"])) / 30.0
+    return save_asset(folder, "pressed-shut", **arguments)
+
+
+def test_a_hand_that_rests_on_the_link_before_its_stroke_spoils_no_control(tmp_path: Path) -> None:
+    """Reflected as a whole it pushes the door open from behind, by honest contact; that says nothing of the replay."""
+    made = pressed_shut(tmp_path)
+    for shift in (-0.003, 0.0, 0.003):
+        joints = made.reference.hand_joints + [0.0, shift, 0.0]
+        asset = replace(made, reference=replace(made.reference, hand_joints=joints))
+        scene = build_scene(asset)
+        point, normal = mirror_plane(scene)
+        whole = HandPath(asset.reference.time, joints - 2 * ((joints - point) @ normal)[..., None] * normal)
+        assert asset.stroke_fraction(simulate(scene, whole).q).max() > 0.01
+        run = simulate(scene, control_path(scene, "mirrored_hand"))
+        assert asset.stroke_fraction(run.q).max() < 0.005
+    assert simulate(scene, HandPath(asset.reference.time, joints)).q[-1] >= 0.9 * asset.demo["q_demo_end"]
+
+
+def test_the_mirrored_control_finds_a_joint_that_answers_to_presence(door: Asset, monkeypatch: pytest.MonkeyPatch
+                                                                     ) -> None:  # fmt: skip
+    """A joint that runs on whenever a hand touches it, however it pushes, is what the control is for."""
+    step = Simulation.step
+
+    def eager(self: Simulation, joints: np.ndarray | None) -> Step:
+        made = step(self, joints)
+        self.data.qfrc_applied[self.scene.dof] = 40.0 if made.contact else 0.0
+        return made
+
+    monkeypatch.setattr(Simulation, "step", eager)
+    controls = replay(door).controls
+    assert controls["mirrored_hand"] > 0.3 and controls["no_hand"] < 1e-3
 
 
 def test_late_hand_has_not_begun_when_time_is_up(door: Asset) -> None:
