@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import subprocess
@@ -25,6 +26,18 @@ def test_kills_leave_assets_whole_or_absent(tmp_path: Path, name: str, kills: in
     job = JOBS[name](tmp_path / name, np.random.default_rng(7))
     job.attack(kills)
     assert job.count == kills and job.problems == []
+
+
+@pytest.mark.slow
+def test_killed_training_goes_on_to_the_same_curve_and_policy(tmp_path: Path) -> None:
+    """In a process of its own: the killed trainings are forked off before it has threads."""
+    out = subprocess.run(
+        [sys.executable, "-m", "benchmarks.faults", "--jobs", "train", "train_sac", "--kills", "3", "--seed", "2",
+         "--json", str(tmp_path / "rows.json")],
+        cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert out.returncode == 0, out.stdout
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["kills"] for row in rows] == [2, 1] and not any(row["problems"] for row in rows)
 
 
 def test_what_a_killed_writer_left_goes_with_the_next_write(tmp_path: Path) -> None:

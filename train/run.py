@@ -107,6 +107,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     if content is not None:
         rows = _restore(model, env, episodes, content)
         resumed, (seconds, used) = model.num_timesteps * config.hold, rows[-1][-2:] if rows else (0.0, 0.0)
+        _write_results(folder, model, normal, config, asset, rows)  # the kill may have come before they were written
     begin, begin_used, saved, made = time.monotonic() - seconds, time.process_time() - used, resumed, resumed
     over = made >= config.steps
     while not over:
@@ -123,8 +124,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         over = made >= config.steps or (minutes is not None and time.monotonic() - begin >= 60 * minutes)
         if made - saved >= config.checkpoint_every or over:
             save_torch(checkpoint, _checkpoint(model, env, normal, episodes, rows))
-            save_policy(folder / "policy.pt", model.policy, normal, config, asset.id)
-            _write_curve(folder / "curve.csv", rows)
+            _write_results(folder, model, normal, config, asset, rows)
             saved = made
     env.close()
     last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
@@ -140,7 +140,8 @@ def _claim(folder: Path, described: dict) -> None:
         if json.loads(file.read_text(encoding="utf-8")) != json.loads(text):
             raise TaaEnvsError(f"{folder} holds a run with other settings or of another asset; choose another --out")
         return
-    if folder.exists() and any(folder.iterdir()):
+    # What a killed write of this very file left does not make the folder somebody else's.
+    if folder.exists() and any(not f.name.startswith(f".{file.name}.") for f in folder.iterdir()):
         raise TaaEnvsError(f"{folder} is not a training run and not empty; choose another --out")
     folder.mkdir(parents=True, exist_ok=True)
     with written_whole(file) as partial:
@@ -151,6 +152,12 @@ def _logger(folder: Path) -> Logger:
     """Event files for TensorBoard where it is installed; the curve is written in any case."""
     found = importlib.util.find_spec("tensorboard") is not None
     return configure(str(folder / "tensorboard"), ["tensorboard"]) if found else Logger(None, [])
+
+
+def _write_results(folder: Path, model: BaseAlgorithm, normal: Normal, config: Config, asset: Asset,
+                   rows: list[list[float]]) -> None:
+    save_policy(folder / "policy.pt", model.policy, normal, config, asset.id)
+    _write_curve(folder / "curve.csv", rows)
 
 
 def _write_curve(file: Path, rows: list[list[float]]) -> None:

@@ -60,6 +60,32 @@ def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp
     assert all(torch.equal(a[key], b[key]) for key in a)
 
 
+def test_a_kill_between_checkpoint_and_results(door: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run is done by its checkpoint, but policy and curve are those of the checkpoint before, or absent."""
+    from train import run
+
+    small = Config(**{**PPO.as_dict(), "steps": 512})
+    train(door, small, tmp_path / "whole")
+    write, calls = run._write_results, []
+
+    def killed(*arguments: object) -> None:
+        calls.append(1)
+        if len(calls) == 2:
+            raise Killed
+        write(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "_write_results", killed)
+        with pytest.raises(Killed):
+            train(door, small, tmp_path / "killed")
+    assert len(curve(tmp_path / "killed")) < len(curve(tmp_path / "whole"))
+    assert train(door, small, tmp_path / "killed")["resumed_at"] == 512
+    assert curve(tmp_path / "killed") == curve(tmp_path / "whole")
+    (tmp_path / "early").mkdir()
+    (tmp_path / "early" / ".config.json.elsewhere-1-x.json").touch()  # what a kill in the very first write leaves
+    assert train(door, small, tmp_path / "early")["steps"] == 512
+
+
 def test_a_run_stops_by_the_clock_and_goes_on(door: Asset, tmp_path: Path) -> None:
     stopped = train(door, PPO, tmp_path / "run", minutes=1e-6)
     assert stopped["steps"] == 256 and (tmp_path / "run" / "policy.pt").is_file()  # one iteration
