@@ -10,6 +10,7 @@ import numpy as np
 
 from reconstruct.cues import ProviderInfo
 from reconstruct.cues_io import CueFolder, read_mesh
+from reconstruct.depth import sample_depth
 from reconstruct.errors import TaaError
 from reconstruct.providers.grounding import ground_tracks
 from reconstruct.providers.released import HandFrames, ReleasedScene
@@ -177,20 +178,6 @@ def project(xyz: np.ndarray, K: np.ndarray, T_world_camera: np.ndarray) -> tuple
     with np.errstate(invalid="ignore", divide="ignore"):
         uvw = np.einsum("tij,ntj->nti", K, x)
         return uvw[..., :2] / uvw[..., 2:], x[..., 2]
-
-
-def sample_depth(depth: np.ndarray, uv: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(N, T) depth of the nearest pixel, NaN where unknown.
-
-    Args:
-        depth: (T, h, w) of any size.  uv: (N, T, 2) full px.  size: (width, height) full px.
-    """
-    T, h, w = depth.shape
-    at = (np.nan_to_num(uv, nan=-1e6, posinf=-1e6, neginf=-1e6) + 0.5) * (w / size[0], h / size[1])
-    at = np.floor(np.clip(at, -1e6, 1e6)).astype(int)
-    inside = (at >= 0).all(-1) & (at < (w, h)).all(-1)
-    x, y = np.clip(at[..., 0], 0, w - 1), np.clip(at[..., 1], 0, h - 1)
-    return np.where(inside, depth[np.arange(T)[None], y, x], np.nan)
 
 
 def _hand(found: ReleasedScene, size: tuple[int, int], cameras: tuple[np.ndarray, np.ndarray], world: np.ndarray,

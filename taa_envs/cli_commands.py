@@ -467,11 +467,12 @@ def doctor(rendering: bool) -> Outcome:
     def words() -> None:
         print(f"Python {data['python']}, {data['machine']}")
         _table("packages", [(name, version or "not installed") for name, version in data["packages"].items()])
+        head = ("stage", "provider", "runs here", "why not, or what to know; licence; how to get it")
         rows = [(p["stage"], p["name"] + (" (default)" if p["default"] else ""), "yes" if p["runs"] else "no",
-                 p["why"], _licences(p), p["get"] + (f"; {p['apart']}" if p["apart"] else ""))
+                 "\n".join((p["why"], _licences(p), *([p["get"]] if p["kind"] != "embedded" else []),
+                            *([p["apart"]] if p["apart"] else []))))
                 for p in data["providers"]]  # fmt: skip
-        head = ("stage", "provider", "runs here", "why not, or what to know", "licence", "how to get it")
-        _table("providers", [head, *rows], header=True)
+        _table("providers", [head, *rows], header=True, lines=True)
         if data["settings"]:
             print(f"settings of the providers: {data['settings']}")
         print(
@@ -606,14 +607,14 @@ def _short(value: object) -> str:
     return str(value)
 
 
-def _table(title: str | None, rows: list[tuple], header: bool = False) -> None:
+def _table(title: str | None, rows: list[tuple], header: bool = False, lines: bool = False) -> None:
     from rich import box
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=title and escape(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD,
-                  show_header=header)  # fmt: skip
+                  show_header=header, show_lines=lines)  # fmt: skip
     for name in rows[0] if rows else ():
         table.add_column(str(name) if header else "", overflow="fold")
     for row in rows[1:] if header else rows:

@@ -17,9 +17,9 @@ import numpy as np
 
 from reconstruct.cues import LinkMasks
 from reconstruct.cues_io import MESHES, read_mesh
+from reconstruct.depth import sample_depth
 from reconstruct.errors import TaaError
 from reconstruct.geometry import LinkMesh
-from reconstruct.import_scene import sample_depth
 from reconstruct.joint.models import JointFit
 from reconstruct.providers.grounding import scale_to
 from reconstruct.providers.make import Made, Request

@@ -5,6 +5,9 @@ The first provider of a stage is its default; a default is embedded, and its wei
 
 from __future__ import annotations
 
+import functools
+import importlib
+import importlib.metadata
 import importlib.util
 import os
 from collections.abc import Mapping
@@ -212,6 +215,9 @@ def obstacle(provider: Provider, settings: Settings) -> str | None:
     for module in provider.modules:
         if not _importable(module):
             return f"the Python module {module} is not installed"
+    if provider.kind == "library" and {"transformers", "depth_anything_3"} & set(provider.modules):
+        if why := broken_torchvision():
+            return why
     if provider.kind == "repository":
         return _repository_obstacle(provider, settings)
     if provider.kind == "library":
@@ -224,6 +230,23 @@ def _importable(module: str) -> bool:
         return importlib.util.find_spec(module) is not None
     except (ImportError, ValueError):  # a broken parent package
         return False
+
+
+@functools.cache
+def broken_torchvision() -> str | None:
+    """Why an installed torchvision cannot be imported, or None.
+
+    transformers needs none, but looks for it, and fails with one that is built for another PyTorch.
+    """
+    if not _importable("torchvision"):
+        return None
+    try:
+        importlib.import_module("torchvision")
+    except Exception as error:  # its compiled part fails in many ways
+        line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        return (f"the installed torchvision does not fit PyTorch {importlib.metadata.version('torch')} ({line}): "
+                "uninstall it, or install the build that belongs to this PyTorch")  # fmt: skip
+    return None
 
 
 def _repository_obstacle(provider: Provider, settings: Settings) -> str | None:

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruct.depth import sample_depth
 from reconstruct.errors import TaaError
-from reconstruct.import_scene import NEAR, project, sample_depth
+from reconstruct.import_scene import NEAR, project
 from reconstruct.providers.make import Made, Request
 from reconstruct.providers.outside import run_script, setting
 from reconstruct.video import Video

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from reconstruct import cues_io
+from reconstruct.depth import sample_depth
 from reconstruct.errors import TaaError
-from reconstruct.import_scene import project, sample_depth
+from reconstruct.import_scene import project
 from reconstruct.providers import da3
 from reconstruct.providers.make import provide
 from reconstruct.synth import load_truth, render_clip
@@ -141,7 +142,7 @@ def test_da3_depth_and_camera_hold_the_simulators_joint(tmp_path, truth, clip, d
     up = np.linalg.inv(camera["T_world_camera"][0])[:3, :3] @ [0, 0, 1]
     assert up[1] < -0.9
     kind, turned, away, angle, unit = joint_error(truth, depth["depth"], camera)
-    assert kind == truth.type and turned < 0.7 and away < 0.01
+    assert kind == truth.type and turned < 0.05 and away < 1e-4
     assert angle == pytest.approx(abs(truth.q[-1]), rel=0.02) and unit == pytest.approx(SCALE * 1.3, rel=0.02)
     assert request.folder.maker("camera").licence == "Apache-2.0"
 

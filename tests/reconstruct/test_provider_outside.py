@@ -83,7 +83,7 @@ def test_trackcraft_tracks_hold_the_simulators_joint(trackcraft, truth):
     assert part.sum() >= 8
     kind, axis, point, _ = joint_between(xyz[part, a], xyz[part, b])
     turned, away = axis_error(axis, point, truth.axis, truth.point, truth.centroid)
-    assert kind == truth.type and turned < 0.5 and away < 0.01 * truth.diagonal
+    assert kind == truth.type and turned < 0.05 and away < 1e-4 * truth.diagonal
     n, t = np.argwhere(visible)[7]
     assert np.allclose(truth.project(xyz[n, t], t), cue["uv"][n, t], atol=0.6), "full px of the source video"
     tracks = cues_io.tracks_from_cue(cue, FRAMES, request.folder.maker("tracks"))

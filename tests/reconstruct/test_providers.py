@@ -79,6 +79,26 @@ def test_a_full_machine_runs_all(full):
     assert set(cannot) <= set(), cannot
 
 
+@pytest.mark.parametrize("text, fits", [("raise RuntimeError('operator torchvision::nms does not exist')", False),
+                                        ("", True)])  # fmt: skip
+def test_a_torchvision_for_another_pytorch_is_an_obstacle(full, tmp_path, monkeypatch, text, fits):
+    """transformers looks for it and fails with it, for all that it does not need it."""
+    (tmp_path / "site" / "torchvision").mkdir(parents=True)
+    (tmp_path / "site" / "torchvision" / "__init__.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.delitem(sys.modules, "torchvision", raising=False)
+    table.broken_torchvision.cache_clear()
+    try:
+        why = obstacle(find("segment", "sam2"), full)
+        assert (why is None) == fits
+        if not fits:
+            assert "torchvision::nms" in why and "uninstall it" in why
+        assert obstacle(find("track", "lk"), full) is None
+    finally:
+        table.broken_torchvision.cache_clear()
+        sys.modules.pop("torchvision", None)
+
+
 def test_each_obstacle_is_named_exactly(full, tmp_path, monkeypatch):
     def without(name, key):
         sections = {n: {k: v for k, v in s.items() if (n, k) != (name, key)} for n, s in full.sections.items()}

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.cues import Tracks
+from reconstruct.depth import sample_depth
 from reconstruct.errors import TaaError
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.rigid.fit import fit_rigid
@@ -33,7 +34,10 @@ def fit_from_cues(tracks: Tracks, camera: Mapping[str, np.ndarray], depth: np.nd
         TaaError: an array has the wrong shape.
     """
     N, T = tracks.visible.shape
-    K = np.asarray(camera["K"], float).reshape(-1, 3, 3)[0]
+    Ks = np.asarray(camera["K"], float).reshape(-1, 3, 3)
+    if len(Ks) not in (1, T):
+        raise TaaError(f"K of cues/camera.npz has {len(Ks)} matrices for {T} frames; give one, or one a frame")
+    K = Ks[0]
     posed = "T_world_camera" in camera
     pose = np.asarray(camera["T_world_camera"], float).reshape(-1, 4, 4) if posed else np.eye(4)[None]
     if len(pose) not in (1, T):
@@ -46,11 +50,14 @@ def fit_from_cues(tracks: Tracks, camera: Mapping[str, np.ndarray], depth: np.nd
         inverse = np.linalg.inv(pose)
         z = np.einsum("tj,ntj->nt", inverse[:, 2, :3], np.asarray(xyz_world, float)) + inverse[:, 2, 3]
     else:
-        z = sample(np.asarray(depth), uv, tracks.visible, size)
+        z = np.where(tracks.visible, sample_depth(np.asarray(depth), uv, size), np.nan)
     link = None
     if moving is not None:
         inside = sample(moving.astype(np.float32), uv, tracks.visible, size)
         link = np.nan_to_num(np.nansum(inside, axis=1) / np.maximum(tracks.visible.sum(1), 1)) > 0.5
+    if len(Ks) > 1:  # a zoom, or a network's own estimate a frame: every picture as the first lens would show it
+        to_first = K @ np.linalg.inv(Ks)
+        uv = np.einsum("tij,ntj->nti", to_first[:, :2, :2], uv) + to_first[:, :2, 2]
     fit = fit_rigid(uv, tracks.visible, z, K, pose, link, metric, seed)
     return fit if posed or fit.verdict == "refused" else _upright(fit)
 
