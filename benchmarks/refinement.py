@@ -21,12 +21,15 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import LinkMasks, ProviderInfo, Tracks
 from reconstruct.joint.models import JointFit
+from reconstruct.providers.features import describe
 from reconstruct.refine import Mesh, refine_joint
 from reconstruct.synth import SynthTruth, load_truth, render_clip
 from reconstruct.synth.render import LINK_CODE
+from reconstruct.video import load_video
 
 WAYS = {"start": (), "image (the paper's)": ("mask", "boundary"), "tracks": ("track",),
-        "image and tracks": ("mask", "boundary", "track")}  # fmt: skip
+        "image and tracks": ("mask", "boundary", "track"),
+        "image, features and tracks": ("mask", "boundary", "feature", "track")}  # fmt: skip
 REDUCED = 3
 """Masks are handed over at a third of the picture's size, so their 3 px are one."""
 
@@ -128,6 +131,8 @@ def main() -> None:
         "--clips", nargs="+", default=["oven", "drawer", "laptop", "cabinet", "monitor", "stapler", "box"]
     )
     parser.add_argument("--rendered", type=Path, help="folder of `taa synth` to read instead of rendering")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--features", default="xfeat", help="provider of the descriptors")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="write the rows here as JSON")
     args = parser.parse_args()
@@ -139,10 +144,16 @@ def main() -> None:
             truth = load_truth(folder)
             fit, tracks, meshes, masks, T = disturbed(truth, args.seed)
             h, w = truth.moving.shape[1:]
-            for way, use in WAYS.items():
+            video = load_video(truth.video, scratch)
+
+            def features(frames, video=video):
+                return describe(video, frames, args.features)[0]
+
+            for way in args.ways:
+                use = WAYS[way]
                 begin = time.monotonic()
                 if use:
-                    got = refine_joint(fit, tracks, meshes, masks, (w, h), use=use)
+                    got = refine_joint(fit, tracks, meshes, masks, (w, h), features, use=use)
                     row = errors(truth, got.fit, got.T_world_mesh @ T) | {"outline_px": got.after["boundary_px"]}
                 else:
                     row = errors(truth, fit, T)

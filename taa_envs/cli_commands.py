@@ -174,19 +174,18 @@ def view(asset_id: str, port: int) -> Outcome:
 
     asset = registry.get_asset(asset_id)
     try:
-        server = serve(asset, port)
+        viewer = serve(asset, port)
     except ImportError:
         raise TaaEnvsError(
             "the viewer needs the package viser; install it with: pip install 'taa-envs[view]'"
         ) from None
-    url = f"http://localhost:{server.get_port()}"
-    print(f"{asset_id} at {url}; stop with Ctrl-C", file=sys.stderr)
+    print(f"{asset_id} at {viewer.url}; stop with Ctrl-C", file=sys.stderr)
     try:
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
-        server.stop()
-    return Outcome({"id": asset_id, "url": url}, lambda: None)
+        viewer.stop()
+    return Outcome({"id": asset_id, "url": viewer.url}, lambda: None)
 
 
 def replay(asset_id: str, hand: str, video: Path | None, refining: bool, reference: str, out: Path | None, seed: int,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import threading
+from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,15 +24,33 @@ FRAME_RATE = 25.0
 """Frames a second while it plays."""
 
 
-def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
-    """Start the viewer of one asset in threads of its own.
+@dataclass(frozen=True)
+class Viewer:
+    """A viewer that runs.
+
+    Attributes:
+        url: where a browser on this machine finds it.
+        end: tells the thread that plays to leave.  server: of the page.
+    """
+
+    url: str
+    end: threading.Event
+    player: threading.Thread
+    server: viser.ViserServer
+
+    def stop(self) -> None:
+        """End the player, then the server."""
+        self.end.set()
+        self.player.join()
+        self.server.stop()
+
+
+def serve(asset: Asset, port: int = 8080) -> Viewer:
+    """Start the viewer of one asset in threads of its own, for browsers on this machine only.
 
     Args:
         asset: as loaded.
         port: to serve on; the next free one is taken where it is in use.
-
-    Returns:
-        The server; ``stop()`` ends it.
 
     Raises:
         ImportError: viser is not installed.
@@ -42,7 +61,7 @@ def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
     spec = mujoco.MjSpec.from_file(str(asset.model_path))
     model = spec.compile()
     data = mujoco.MjData(model)
-    server = viser.ViserServer(port=port, verbose=False)
+    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     server.scene.set_up_direction("+z")
     frames = {}
     for name in ("static", "moving"):
@@ -61,7 +80,7 @@ def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
     middle = middle + ((centre - middle) @ axis) * axis
     ends = np.stack([middle - 0.5 * size * axis, middle + 0.5 * size * axis])
     server.scene.add_line_segments("/axis", ends[None], colors=(255, 59, 72), line_width=4.0)
-    server.initial_camera.position = tuple(centre + size * np.array([0.6, -1.3, 0.7]))
+    server.initial_camera.position = tuple(centre + size * np.array([0.4, -0.9, 0.5]))
     server.initial_camera.look_at = tuple(centre)
 
     reference = asset.reference
@@ -96,29 +115,27 @@ def serve(asset: Asset, port: int = 8080) -> viser.ViserServer:
         pose()
         hand(row)
 
-    running = threading.Event()
+    playing, end = threading.Event(), threading.Event()
 
     def run() -> None:
         first, last = float(reference.time[0]), float(reference.time[-1])
-        while running.is_set():
+        while not end.is_set():
             begin = monotonic()
-            later = time.value + 1 / FRAME_RATE
-            time.value = first if later > last else later  # its callback moves joint and hand
-            sleep(max(0.0, 1 / FRAME_RATE - (monotonic() - begin)))
+            if playing.is_set():
+                later = time.value + 1 / FRAME_RATE
+                time.value = first if later > last else later  # its callback moves joint and hand
+            end.wait(max(0.0, 1 / FRAME_RATE - (monotonic() - begin)))
 
     @play.on_click
     def _(_: object) -> None:
-        if running.is_set():
-            running.clear()
-            play.label = "play"
-        else:
-            running.set()
-            play.label = "pause"
-            threading.Thread(target=run, daemon=True).start()
+        (playing.clear if playing.is_set() else playing.set)()
+        play.label = "pause" if playing.is_set() else "play"
 
     pose()
     hand(0)
-    return server
+    player = threading.Thread(target=run, daemon=True)
+    player.start()
+    return Viewer(f"http://localhost:{server.get_port()}", end, player, server)
 
 
 def _mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, folder: Path) -> Any:

@@ -7,6 +7,7 @@ noise like everything else, because silhouettes say little about a turn that lea
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +19,8 @@ from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.joint.models import JointFit
 from reconstruct.refine.coverage import Edges, Mesh, Topology, coverage, face_ids, link_edges
 from reconstruct.refine.terms import Observed, boundary_term, feature_term, mask_term, observe, sample
+
+Describe = Callable[[Sequence[int]], np.ndarray]
 
 LOG_SCALE_STD = 0.05
 """A mesh that was grounded by depth is seldom off by more than a few percent."""
@@ -109,7 +112,7 @@ def key_frames(q: np.ndarray, moving_hidden: np.ndarray, count: int) -> np.ndarr
 
 
 def refine_joint(fit: JointFit, tracks: Tracks | None, meshes: dict[str, Mesh], masks: LinkMasks,
-                 image_size: tuple[int, int], features: np.ndarray | None = None, count: int = 10, width: int = 240,
+                 image_size: tuple[int, int], features: Describe | None = None, count: int = 10, width: int = 240,
                  use: tuple[str, ...] = ("mask", "boundary", "feature", "track"),
                  stages: int = 3) -> Refinement:  # fmt: skip
     """Refine a joint against masks, features and tracks.
@@ -120,7 +123,7 @@ def refine_joint(fit: JointFit, tracks: Tracks | None, meshes: dict[str, Mesh], 
         meshes: "static" and "moving" in the world at q = 0.
         masks: of the links and of hands, (T, h, w).
         image_size: (width, height) of the full picture, px.
-        features: (T, C, h, w) descriptors of the frames, or None.
+        features: frames -> their (n, gh, gw, C) unit descriptors on a grid over the picture, or None.
         count: key frames.  width: of the reduced picture, px.
         use: the terms of the cost: "mask", "boundary", "feature", "track".
         stages: 1 states, 2 and the joint, 3 and the meshes' rigid transform and scale.
@@ -133,7 +136,7 @@ def refine_joint(fit: JointFit, tracks: Tracks | None, meshes: dict[str, Mesh], 
     unknown = set(use) - {"mask", "boundary", "feature", "track"}
     if unknown or not use:
         raise TaaError(f"unknown term {sorted(unknown)}; known: mask, boundary, feature, track")
-    scene = _scene(fit, tracks, meshes, masks, image_size, features, count, width)
+    scene = _scene(fit, tracks, meshes, masks, image_size, features if "feature" in use else None, count, width)
     steps = _Parameters(scene)
     before = _measure(scene, steps)
     # The noise of each kind of evidence where the search starts; floors are a raster's and a tracker's resolution.
@@ -149,7 +152,7 @@ def refine_joint(fit: JointFit, tracks: Tracks | None, meshes: dict[str, Mesh], 
 
 
 def _scene(fit: JointFit, tracks: Tracks | None, meshes: dict[str, Mesh], masks: LinkMasks,
-           image_size: tuple[int, int], features: np.ndarray | None, count: int, width: int) -> _Scene:  # fmt: skip
+           image_size: tuple[int, int], features: Describe | None, count: int, width: int) -> _Scene:  # fmt: skip
     w, h = image_size
     reduced = (width, round(width * h / w))
     ratio = np.array([reduced[0] / w, reduced[1] / h])
@@ -169,8 +172,8 @@ def _scene(fit: JointFit, tracks: Tracks | None, meshes: dict[str, Mesh], masks:
     }
     small = described = None
     if features is not None:
-        small = torch.from_numpy(np.asarray(features[frames], float))
-        small = torch.nn.functional.interpolate(small, size=(reduced[1], reduced[0]), mode="bilinear")
+        grid = torch.from_numpy(np.asarray(features([int(t) for t in frames]), float)).permute(0, 3, 1, 2)
+        small = torch.nn.functional.interpolate(grid, size=(reduced[1], reduced[0]), mode="bilinear")
         small = torch.nn.functional.normalize(small, dim=1)
     uv = np.zeros((0, len(frames), 2))
     visible = np.zeros((0, len(frames)), bool)
