@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -404,8 +404,12 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
 
     geometry: Geometry = stages.run("geometry", shape, ("geometry",), options={"meshes": meshes})
     if "masks" in given and len(meshes) == len(cues_io.MESHES):
-        fit, geometry, words = _refine(video, tracks, fit, geometry, masks, stages)
+        fit, geometry, words, maker = _refine(video, tracks, fit, geometry, masks, stages)
         seen = replace(seen, fit=fit, notes=(*seen.notes, words))
+        makers |= {maker: None} if maker else {}
+    elif stages.chosen.get("features", "none") != "none":
+        stages.notes.append(f"the descriptors of {stages.chosen['features']} were not used: only masks and meshes from "
+                            "outside are refined with them")  # fmt: skip
     geometry = keep_clear(geometry, fit)
     reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
     if folder:
@@ -442,19 +446,32 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
 
 
 def _refine(video: Video, tracks: Tracks, fit: JointFit, geometry: Geometry, masks: LinkMasks,
-            stages: Stages) -> tuple[JointFit, Geometry, str]:  # fmt: skip
-    """The joint and the meshes' place by the masks: for masks and meshes that were not cut by the joint itself."""
+            stages: Stages) -> tuple[JointFit, Geometry, str, ProviderInfo | None]:  # fmt: skip
+    """The joint and the meshes' place by the masks: for masks and meshes that were not cut by the joint itself.
+
+    Also says in words what came of it, and who made the descriptors, if any were asked for.
+    """
+    from reconstruct.providers.features import describe
     from reconstruct.refine import Mesh, Refinement, moved, refine_joint
 
     links = {"static": geometry.static, "moving": geometry.moving}
     meshes = {name: Mesh(link.vertices, link.faces) for name, link in links.items()}
-    got: Refinement = stages.run(
-        "refine", lambda: refine_joint(fit, tracks, meshes, masks, video.size), ("refine",), keep=False
-    )
-    moved_px = f"outline {got.before['mask_px']:.2f} -> {got.after['mask_px']:.2f} px at 240 px width"
+    name = stages.chosen.get("features", "none")
+    makers: list[ProviderInfo] = []
+
+    def features(frames: Sequence[int]) -> np.ndarray:
+        grid, maker = describe(video, frames, name)
+        makers.append(maker)
+        return grid
+
+    described = features if name != "none" else None
+    got: Refinement = stages.run("refine", lambda: refine_joint(fit, tracks, meshes, masks, video.size, described),
+                                 ("refine",), keep=False)  # fmt: skip
+    maker = makers[0] if makers else None
+    words = f"outline {got.before['mask_px']:.2f} -> {got.after['mask_px']:.2f} px at 240 px width"
     if not got.after["mask_px"] < got.before["mask_px"]:
-        return fit, geometry, f"image-space refinement did not bring the outline closer ({moved_px}); not used"
-    return got.fit, moved(geometry, got), f"joint and meshes refined against the masks: {moved_px}"
+        return fit, geometry, f"image-space refinement did not bring the outline closer ({words}); not used", maker
+    return got.fit, moved(geometry, got), f"joint and meshes refined against the masks: {words}", maker
 
 
 def fit_scene(scene: str | Path, focal: float | None = None, seed: int = 0, progress: Progress | None = None) -> dict:

@@ -61,6 +61,8 @@ class Reconstruct(Common):
     """Provider of link meshes: hull, sam3d."""
     labels: str | None = None
     """Provider of the part labels of whole meshes: votes, segvigen."""
+    features: str | None = None
+    """Provider of descriptors for the refinement against given masks and meshes: none, xfeat, dinov2."""
     camera: str | None = None
     """Provider of camera poses: none, colmap, da3."""
     overwrite: bool = False
@@ -69,7 +71,7 @@ class Reconstruct(Common):
     """Seed of everything that draws."""
 
     def run(self) -> Outcome:
-        names = ("segment", "depth", "track", "hand", "mesh", "labels", "camera")
+        names = ("segment", "depth", "track", "hand", "mesh", "labels", "features", "camera")
         chosen = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return commands.reconstruct(self.video, self.id, self.scene, self.out, self.focal, chosen, self.overwrite,
                                     self.seed)  # fmt: skip
@@ -317,6 +319,8 @@ class Build(Common):
     """Provider of link meshes."""
     labels: str | None = None
     """Provider of the part labels of whole meshes."""
+    features: str | None = None
+    """Provider of descriptors for the refinement."""
     camera: str | None = None
     """Provider of camera poses."""
     focal: float | None = None
@@ -327,7 +331,7 @@ class Build(Common):
     """Seed of everything that draws."""
 
     def run(self) -> Outcome:
-        names = ("segment", "depth", "track", "hand", "mesh", "labels", "camera")
+        names = ("segment", "depth", "track", "hand", "mesh", "labels", "features", "camera")
         chosen = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return commands.build(self.videos, self.out, self.engine, self.workers, self.retries, self.timeout, self.again,
                               chosen, self.focal, self.overwrite, self.seed)  # fmt: skip

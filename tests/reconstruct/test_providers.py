@@ -145,9 +145,9 @@ def test_no_default_is_non_commercial_or_needs_anything(bare):
 def test_every_provider_that_can_be_chosen_has_its_function():
     for stage in table.CHOSEN:
         for p in PROVIDERS[stage][1:]:
-            if stage != "labels" and p.kind != "repository":
+            if stage not in table.TOOLS and p.kind != "repository":
                 assert callable(maker_of(stage, p.name)), (stage, p.name)
-    assert set(_MODULES) == {(s, p.name) for s in table.CHOSEN if s != "labels" for p in PROVIDERS[s][1:]}
+    assert set(_MODULES) == {(s, p.name) for s in table.CHOSEN if s not in table.TOOLS for p in PROVIDERS[s][1:]}
 
 
 def test_choosing(bare):

@@ -156,6 +156,28 @@ def test_tracks_alone_bring_a_wrong_joint_back_and_fill_all_frames(scene):
     assert np.abs(scale * got.fit.q - fit.q).max() < 0.03 * np.ptp(fit.q)
 
 
+@pytest.mark.slow
+def test_descriptors_alone_bring_a_sliding_link_closer(scene):
+    """They are not invariant to turns, so it is the slide that they measure; on cells of 8 px, hence not exactly."""
+    from reconstruct.providers.features import describe
+
+    made, meshes, masks = scene
+    if made.fit.type != "prismatic":
+        pytest.skip("one type is enough")
+    h, w = masks.moving.shape[1:]
+    asked = []
+
+    def features(frames):
+        asked.extend(frames)
+        return describe(made.video, frames, "xfeat")[0]
+
+    start = replace(made.fit, q=1.06 * made.fit.q)
+    got = refine_joint(start, None, meshes, masks, (w, h), features, count=5, use=("feature",), stages=1)
+    assert sorted(asked) == list(got.frames), "only key frames are described"
+    before, after = (np.abs((fit.q - made.fit.q)[got.frames]).mean() for fit in (start, got.fit))
+    assert after < 0.7 * before
+
+
 def test_a_refinement_moves_both_links_and_their_parts(scene):
     made, meshes, _ = scene
     T = np.diag([1.1, 1.1, 1.1, 1.0])
