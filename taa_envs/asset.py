@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import stat
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from taa_envs.checks import (
     check_compiled,
     check_id,
     check_xml,
+    further_joints,
+    numbered,
     read_metadata,
 )
 from taa_envs.errors import AssetError, AssetExists, TaaEnvsError
@@ -36,6 +39,8 @@ MAX_ARRAY_BYTES = 256 << 20
 MAX_FILES = 4096
 MAX_DEPTH = 8  # folders below folders
 MAX_FRAMES = 200_000
+ARRAYS = ("time", "q", "hand_joints", "hand_valid", "contact")
+"""Of ``reference.npz``; an object with further joints has their states beside them, ``q_2`` and so on."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ class Reference:
         hand_joints: (T, 21, 3) landmarks (0 wrist, 4/8/12/16/20 finger tips).
         hand_valid: (T,) bool, False where the hand was filled in.
         contact: (T,) bool, the frames in which the hand drives the part.
+        further: (T,) states of ``joint_2``, ``joint_3`` ...; empty for an object with one joint.
     """
 
     time: np.ndarray
@@ -54,26 +60,27 @@ class Reference:
     hand_joints: np.ndarray
     hand_valid: np.ndarray
     contact: np.ndarray
+    further: tuple[np.ndarray, ...] = ()
 
     @classmethod
-    def from_arrays(cls, source: object) -> Reference:
-        """Copy of anything with the five fields (attributes or keys), checked.
+    def from_arrays(cls, source: object, further: Sequence[np.ndarray] = ()) -> Reference:
+        """Copy of anything with the five arrays (attributes or keys), checked, and of the further joints' states.
 
         Raises:
             AssetError: an array is missing, of a wrong shape, or not finite.
         """
-        values = {}
-        for f in fields(cls):
+        raw = {numbered("q", k): array for k, array in enumerate(further, 2)}
+        for name in ARRAYS:
             try:
-                raw = source[f.name] if isinstance(source, dict) else getattr(source, f.name)
+                raw[name] = source[name] if isinstance(source, dict) else getattr(source, name)
             except (KeyError, AttributeError):
-                raise AssetError(f"reference has no array {f.name!r}; write all of time, q, hand_joints, hand_valid, "
-                                 "contact") from None
-            kind = bool if f.name in ("hand_valid", "contact") else float
+                raise AssetError(f"reference has no array {name!r}; write all of {', '.join(ARRAYS)}") from None
+        values = {}
+        for name, array in raw.items():
             try:
-                values[f.name] = np.array(raw, dtype=kind)
+                values[name] = np.array(array, dtype=bool if name in ("hand_valid", "contact") else float)
             except (TypeError, ValueError) as error:
-                raise AssetError(f"reference array {f.name!r} does not hold numbers ({error})") from None
+                raise AssetError(f"reference array {name!r} does not hold numbers ({error})") from None
         n = values["time"].shape[0] if values["time"].ndim == 1 else -1
         if not 2 <= n <= MAX_FRAMES:
             raise AssetError(f"reference needs 2 to {MAX_FRAMES} frames, time has shape {values['time'].shape}")
@@ -87,7 +94,13 @@ class Reference:
                 raise AssetError(f"reference array {name!r} holds numbers beyond {MAX_LENGTH:g}; give s, rad and m")
         if not (np.diff(values["time"]) > 0).all():
             raise AssetError("reference time does not increase; sort the frames and drop doubles")
-        return cls(**values)
+        return cls(*(values[name] for name in ARRAYS),
+                   further=tuple(values[numbered("q", k + 2)] for k in range(len(further))))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Name -> array, as ``reference.npz`` names them."""
+        return {**{name: getattr(self, name) for name in ARRAYS},
+                **{numbered("q", k): q for k, q in enumerate(self.further, 2)}}
 
 
 def demonstration(q: np.ndarray) -> dict:
@@ -128,6 +141,7 @@ class Asset:
         reference: the demonstration's arrays.
         camera: {"K", "T_camera_world", "width", "height"} in full px, or None.
         metadata: all of ``asset.json`` (source, providers, mujoco_version, notes ...).
+        further: the joints ``joint_2``, ``joint_3`` ... of an object with several moving links, like ``joint``.
     """
 
     id: str
@@ -139,6 +153,7 @@ class Asset:
     reference: Reference
     camera: dict | None = None
     metadata: dict = field(default_factory=dict)
+    further: tuple[dict, ...] = ()
 
     @property
     def model_path(self) -> Path:
@@ -147,6 +162,16 @@ class Asset:
     @property
     def joint_type(self) -> str:
         return self.joint["type"]
+
+    @property
+    def pitch(self) -> float:
+        """Of a screw, m that the link advances in a radian; 0 for a hinge or a slide."""
+        return float(self.joint["pitch"]) if self.joint_type == "screw" else 0.0
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Bodies that move, the one of the task's joint first."""
+        return tuple(numbered("moving", k + 1) for k in range(1 + len(self.further)))
 
     @property
     def unit(self) -> str:
@@ -196,17 +221,20 @@ def _regular_files(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _read_reference(path: Path) -> Reference:
-    names = [f.name for f in fields(Reference)]
+def _read_reference(path: Path, further: int) -> Reference:
+    more = [numbered("q", k + 2) for k in range(further)]
     try:
-        return Reference.from_arrays(read_npz(path, names, MAX_ARRAY_BYTES))
+        arrays = read_npz(path, [*ARRAYS, *more], MAX_ARRAY_BYTES)
+        if missing := [name for name in more if name not in arrays]:
+            raise AssetError(f"{path} has no array {missing[0]!r}, the states of asset.json's further joint")
+        return Reference.from_arrays(arrays, [arrays[name] for name in more])
     except ArrayFileError as error:
         raise AssetError(str(error)) from None
     except OSError as error:
         raise AssetError(f"{path} cannot be read ({error.strerror})") from None
 
 
-def _check_model(path: Path, joint: dict) -> None:
+def _check_model(path: Path, joint: dict, further: Sequence[dict]) -> None:
     import mujoco
 
     try:
@@ -214,7 +242,7 @@ def _check_model(path: Path, joint: dict) -> None:
     except (ValueError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         raise AssetError(f"{path} does not load in MuJoCo {mujoco.__version__}: {' '.join(str(error).split())[:200]}"
                          ) from None
-    check_compiled(model, path, joint)
+    check_compiled(model, path, joint, further)
 
 
 def load_asset(path: str | os.PathLike, *, check_model: bool = True) -> Asset:
@@ -233,15 +261,16 @@ def load_asset(path: str | os.PathLike, *, check_model: bool = True) -> Asset:
         if name not in files:
             raise AssetError(f"{folder} has no {name}")
     data = read_metadata(folder)
-    reference = _read_reference(files["reference.npz"])
+    further = further_joints(data)
+    reference = _read_reference(files["reference.npz"], len(further))
     if data["demo"]["demo_end_frame"] >= len(reference.time):
         raise AssetError(f"{folder}: demo_end_frame lies after the reference's last frame")
     check_xml(files["model.xml"], files)
     if check_model:
-        _check_model(files["model.xml"], data["joint"])
+        _check_model(files["model.xml"], data["joint"], further)
     return Asset(id=data["id"], path=folder, schema=data["schema"], joint=data["joint"],
                  provenance=data["provenance"], demo=data["demo"], reference=reference, camera=data.get("camera"),
-                 metadata=data)
+                 metadata=data, further=tuple(further))
 
 
 def save_asset(root: str | os.PathLike, asset_id: str, **kwargs: Any) -> Asset:

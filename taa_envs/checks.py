@@ -11,7 +11,7 @@ import json
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 from xml.etree import ElementTree
@@ -22,7 +22,8 @@ from taa_envs.errors import AssetError
 
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 ORIGINS = ("observed", "fitted", "assumed", "given")
-JOINT_TYPES = ("revolute", "prismatic")
+JOINT_TYPES = ("revolute", "prismatic", "screw")
+MAX_LINKS = 9  # moving ones of one object
 
 SCHEMA = "taa-asset/1"
 MAX_JSON_BYTES = 8 << 20
@@ -37,7 +38,7 @@ MAX_LENGTH = 1e4  # m, of any coordinate
 MAX_MASS = 1e6  # kg
 
 SECTIONS = frozenset("mujoco compiler option flag visual global quality headlight map scale rgba statistic default "
-                     "asset worldbody contact actuator sensor custom".split())
+                     "asset worldbody contact equality actuator sensor custom".split())
 ASSETS = frozenset("mesh texture material layer".split())
 TREE = frozenset("body inertial joint geom site camera light pair exclude numeric text".split())
 # A passive joint may carry passive actuators (nu stays 0); whatever has a control is refused after compiling.
@@ -51,6 +52,19 @@ BOUNDS = {"nsample": 1000, "width": 4096, "height": 4096, "nchannel": 4, "resolu
           "sdf_initpoints": 1000, "shadowsize": 16384, "offsamples": 64, "numslices": 256, "numstacks": 256,
           "numquads": 256, "offwidth": 16384, "offheight": 16384, "maxhullvert": 100_000, "size": MAX_LENGTH}
 """Attribute -> largest number it may hold: what MuJoCo or a renderer allocates or repeats by it."""
+
+
+def numbered(name: str, link: int) -> str:
+    """What belongs to a moving link, counted from 1: ``joint``, ``joint_2``, ``joint_3`` ..."""
+    return name if link == 1 else f"{name}_{link}"
+
+
+def further_joints(data: Mapping) -> list[dict]:
+    """``joint_2``, ``joint_3`` ... of an ``asset.json``, in order; empty for an object with one joint."""
+    out: list[dict] = []
+    while isinstance(data.get(numbered("joint", len(out) + 2)), dict) and len(out) + 1 < MAX_LINKS:
+        out.append(data[numbered("joint", len(out) + 2)])
+    return out
 
 
 def check_id(asset_id: object) -> str:
@@ -104,7 +118,8 @@ def parse_metadata(raw: bytes, path: str) -> dict:
     for key in ("joint", "provenance", "demo"):
         if not isinstance(data.get(key), dict):
             raise AssetError(f"{path} has no object {key!r}")
-    _check_joint(data["joint"])
+    for joint in (data["joint"], *further_joints(data)):
+        _check_joint(joint)
     _check_provenance(data["provenance"])
     _check_demo(data["demo"])
     if data.get("camera") is not None:
@@ -153,10 +168,12 @@ def _check_joint(joint: dict) -> None:
     axis = _vector(joint.get("axis"), (3,), "joint axis")
     if abs(np.linalg.norm(axis) - 1) > 1e-3:
         raise AssetError(f"joint axis has length {np.linalg.norm(axis):.4g}; normalise it")
-    if joint["type"] == "revolute":
+    if joint["type"] != "prismatic":
         point = _vector(joint.get("point"), (3,), "joint point")
         if np.abs(point).max() > MAX_LENGTH:
             raise AssetError(f"joint point lies more than {MAX_LENGTH:g} m away")
+    if joint["type"] == "screw" and not 0 < abs(float(_vector(joint.get("pitch"), (), "joint pitch"))) <= MAX_LENGTH:
+        raise AssetError("a screw's pitch must be a number of m/rad other than 0")
     for key, kinds in _JOINT_KINDS.items():
         if joint.get(key) is not None and not (isinstance(joint[key], kinds) and _plain_members(joint[key])):
             raise AssetError(f"joint {key} must be {' or '.join(k.__name__ for k in kinds)} of numbers or null")
@@ -345,24 +362,29 @@ def _check_picture(path: Path) -> None:
         raise AssetError(f"{path} has more than {MAX_PICTURE_SIDE} pixels a side")
 
 
-def check_compiled(model: Any, path: Path, joint: Mapping) -> None:
-    """That a compiled model is an asset's: its bodies, its one passive joint, finite numbers of a sane size.
+def check_compiled(model: Any, path: Path, joint: Mapping, further: Sequence[Mapping] = ()) -> None:
+    """That a compiled model is an asset's: its bodies, their passive joints, finite numbers of a sane size.
+
+    Args:
+        joint: the joint of ``moving`` as ``asset.json`` has it.  further: those of ``moving_2`` and so on.
 
     Raises:
         AssetError: what is wrong with it.
     """
-    import mujoco
-
     bodies = {model.body(i).name for i in range(model.nbody)}
-    if not {"static", "moving"} <= bodies:
-        raise AssetError(f"{path} has bodies {str(sorted(bodies - {'world'}))[:200]}; it needs static and moving")
-    if model.nu or model.neq or model.nv != 1 or model.njnt != 1 or model.joint(0).name != "joint":
-        raise AssetError(f"{path} must have one joint named 'joint', no actuator and no equality")
-    kind = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
-    if kind.get(int(model.jnt_type[0])) != joint["type"]:
-        raise AssetError(f"{path}: the joint's type is not asset.json's {joint['type']!r}")
-    if int(model.jnt_bodyid[0]) != model.body("moving").id:
-        raise AssetError(f"{path}: the joint does not belong to the body 'moving'")
+    wanted = ["static", *(numbered("moving", k + 1) for k in range(1 + len(further)))]
+    if not set(wanted) <= bodies:
+        raise AssetError(f"{path} has bodies {str(sorted(bodies - {'world'}))[:200]}; it needs {' and '.join(wanted)}")
+    names = [model.joint(i).name for i in range(model.njnt)]
+    screws = [k for k, j in enumerate((joint, *further), 1) if j["type"] == "screw"]
+    expected = [n for k in range(1, 2 + len(further))
+                for n in (numbered("joint", k), *([numbered("advance", k)] if k in screws else []))]
+    if model.nu or names != expected or model.nv != len(names) or model.neq != len(screws):
+        also = f" and {len(screws)} equality of a screw's turn and advance" if screws else " and no equality"
+        raise AssetError(f"{path} must have {'one joint named' if len(expected) == 1 else 'the joints'} "
+                         f"{', '.join(map(repr, expected))}, no actuator{also}")
+    for k, one in enumerate((joint, *further), 1):
+        _check_compiled_joint(model, path, k, one)
     for name, bound in (("body_pos", MAX_LENGTH), ("body_ipos", MAX_LENGTH), ("geom_pos", MAX_LENGTH),
                         ("geom_size", MAX_LENGTH), ("mesh_vert", MAX_LENGTH), ("jnt_pos", MAX_LENGTH),
                         ("jnt_range", MAX_LENGTH), ("body_mass", MAX_MASS), ("body_inertia", math.inf),
@@ -370,3 +392,27 @@ def check_compiled(model: Any, path: Path, joint: Mapping) -> None:
         values = getattr(model, name)
         if values.size and not (np.isfinite(values).all() and np.abs(values).max() <= bound):
             raise AssetError(f"{path}: {name} is not finite or beyond {bound:g}")
+
+
+def _check_compiled_joint(model: Any, path: Path, link: int, joint: Mapping) -> None:
+    """That the joint of a moving link is what ``asset.json`` says, and belongs to it."""
+    import mujoco
+
+    found = model.joint(numbered("joint", link))
+    slide = int(model.jnt_type[found.id]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    hinge = int(model.jnt_type[found.id]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    if not (slide if joint["type"] == "prismatic" else hinge):
+        raise AssetError(f"{path}: the type of {found.name} is not asset.json's {joint['type']!r}")
+    body = model.body(numbered("moving", link))
+    if int(model.jnt_bodyid[found.id]) != body.id:
+        raise AssetError(f"{path}: {found.name} does not belong to the body {body.name!r}")
+    if joint["type"] != "screw":
+        return
+    advance = model.joint(numbered("advance", link))
+    ties = [e for e in range(model.neq) if (int(model.eq_obj1id[e]), int(model.eq_obj2id[e])) == (advance.id, found.id)]
+    if int(model.jnt_type[advance.id]) != int(mujoco.mjtJoint.mjJNT_SLIDE) or len(ties) != 1 or (
+            int(model.jnt_bodyid[advance.id]) != body.id
+            or int(model.eq_type[ties[0]]) != int(mujoco.mjtEq.mjEQ_JOINT)):
+        raise AssetError(f"{path}: {advance.name} must be a slide of {body.name!r} tied to {found.name} by an equality")
+    if np.abs(model.eq_data[ties[0], :5] - [0.0, joint["pitch"], 0.0, 0.0, 0.0]).max() > 1e-6 * abs(joint["pitch"]):
+        raise AssetError(f"{path}: {advance.name} does not advance by asset.json's pitch")

@@ -65,7 +65,7 @@ def along(asset: Asset, x: np.ndarray) -> np.ndarray:
     axis = sign * np.array(asset.joint["axis"], float)
     if asset.joint_type == "prismatic":
         return np.broadcast_to(axis, x.shape)
-    v = np.cross(np.broadcast_to(axis, x.shape), x - np.array(asset.joint["point"], float))
+    v = np.cross(np.broadcast_to(axis, x.shape), x - np.array(asset.joint["point"], float)) + asset.pitch * axis
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
 
 

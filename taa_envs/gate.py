@@ -128,45 +128,70 @@ def sweep_contacts(asset: Asset, states: int = SWEEP_STATES) -> tuple[int, float
     """Contacts between the links over the joint's range, and the deepest penetration, m."""
     import mujoco
 
+    from taa_envs.scene import follow_screws
+
     model = _meeting_model(asset)
     data = mujoco.MjData(model)
     count, depth = 0, 0.0
-    for q in np.linspace(*model.jnt_range[0], states):
-        data.qpos[0] = q
-        mujoco.mj_fwdPosition(model, data)
-        deep = -np.asarray(data.contact.dist[:data.ncon])
-        deep = deep[deep > PENETRATION]
-        count += len(deep)
-        depth = max(depth, float(deep.max(initial=0.0)))
+    free = np.flatnonzero(model.jnt_limited)
+    for joint in free:
+        # Each joint alone with the others at rest, and with each of the others at its stops.
+        beside = [None, *((k, end) for k in free if k != joint for end in model.jnt_range[k])]
+        for other in beside:
+            for q in np.linspace(*model.jnt_range[joint], states):
+                data.qpos[:] = 0.0
+                data.qpos[joint] = q
+                if other is not None:
+                    data.qpos[other[0]] = other[1]
+                follow_screws(model, data.qpos)
+                mujoco.mj_fwdPosition(model, data)
+                deep = -np.asarray(data.contact.dist[:data.ncon])
+                deep = deep[deep > PENETRATION]
+                count += len(deep)
+                depth = max(depth, float(deep.max(initial=0.0)))
     return count, depth
 
 
 def sweep_by_force(asset: Asset) -> float:
     """Share of the range that a generalized force 1.5 times the friction, and damping at a slow pace, can cover.
 
-    Pushed from each stop to the other with the links free to collide; the lesser of the two is returned.
+    Pushed from each stop to the other with the links free to collide; the least of all joints and ways is returned.
     """
+    model = _meeting_model(asset)
+    return min(_pushed(model, int(joint)) for joint in np.flatnonzero(model.jnt_limited))
+
+
+def _pushed(model: mujoco.MjModel, joint: int) -> float:
     import mujoco
 
-    model = _meeting_model(asset)
-    low, high = model.jnt_range[0]
+    from taa_envs.scene import follow_screws
+
+    low, high = model.jnt_range[joint]
     seconds = 8.0
     pace = 2.0 * (high - low) / seconds
     data = mujoco.MjData(model)
     covered = 1.0
+    full = np.zeros((model.nv, model.nv))
     for start, sign in ((low, 1.0), (high, -1.0)):
         mujoco.mj_resetData(model, data)
-        data.qpos[0] = start
+        data.qpos[joint] = start
+        follow_screws(model, data.qpos)
         mujoco.mj_forward(model, data)
         # Gravity is what the joint carries besides friction where the link is not balanced.
-        held = float(np.abs(data.qfrc_bias[0] - data.qfrc_gravcomp[0]))
-        inertia = float(data.M[0]) if hasattr(data, "M") else float(data.qM[0])
-        force = 1.5 * model.dof_frictionloss[0] + model.dof_damping[0] * pace + 2.0 * inertia * pace + 2.0 * held
-        data.qfrc_applied[0] = sign * force
+        held = float(np.abs(data.qfrc_bias[joint] - data.qfrc_gravcomp[joint]))
+        mujoco.mj_fullM(model, data, full)
+        # With a screw's advance: what moves when this joint moves by one.
+        along = np.zeros(model.nv)
+        along[joint] = 1.0
+        follow_screws(model, along)
+        inertia = float(along @ full @ along)
+        force = (1.5 * model.dof_frictionloss[joint] + np.ravel(model.dof_damping[joint])[0] * pace
+                 + 2.0 * inertia * pace + 2.0 * held)
+        data.qfrc_applied[joint] = sign * force
         best = 0.0
         for _ in range(int(seconds / model.opt.timestep)):
             mujoco.mj_step(model, data)
-            best = max(best, sign * (data.qpos[0] - start) / (high - low))
+            best = max(best, sign * (data.qpos[joint] - start) / (high - low))
             if best >= 0.999:
                 break
         covered = min(covered, best)
@@ -183,41 +208,53 @@ def settle(asset: Asset, seed: int = 0) -> tuple[tuple[float | None, ...], float
     import mujoco
     from mujoco import rollout
 
+    from taa_envs.scene import follow_screws
+
     spec = mujoco.MjSpec.from_file(str(asset.model_path))
     spec.add_sensor(name="potential", type=mujoco.mjtSensor.mjSENS_E_POTENTIAL)
     spec.add_sensor(name="kinetic", type=mujoco.mjtSensor.mjSENS_E_KINETIC)
     model = spec.compile()
-    low, span = float(model.jnt_range[0, 0]), float(np.ptp(model.jnt_range[0]))
+    free = np.flatnonzero(model.jnt_limited)  # all but the slides that follow screws
+    low, span = model.jnt_range[free, 0], np.ptp(model.jnt_range[free], axis=1)
     rng = np.random.default_rng(seed)
-    first = np.zeros((SETTLE_STATES, 3))  # time, q, velocity: MuJoCo's full physics state of a model with one joint
-    first[:, 1] = low + span * rng.uniform(size=SETTLE_STATES)
-    first[1::2, 2] = span * rng.uniform(-1, 1, SETTLE_STATES // 2)
+    # time, q, velocity: MuJoCo's full physics state of a model that has nothing but hinges and slides
+    first = np.zeros((SETTLE_STATES, 1 + 2 * model.njnt))
+    q, velocity = first[:, 1:1 + model.njnt], first[:, 1 + model.njnt:]
+    q[:, free] = low + span * rng.uniform(size=(SETTLE_STATES, len(free)))
+    velocity[1::2, free] = span * rng.uniform(-1, 1, (SETTLE_STATES // 2, len(free)))
+    follow_screws(model, q)
+    follow_screws(model, velocity)
     steps = int(SETTLE_SECONDS / model.opt.timestep)
     states, energies = rollout.rollout(model, mujoco.MjData(model), first, nstep=steps)
     if not (np.isfinite(states).all() and np.isfinite(energies).all()):
         return (None,) * SETTLE_STATES, float("inf"), float("inf")
     late = steps * 2 // 3
-    moving = np.abs(states[:, :, 2]) > DRIFT_SHARE * span
+    moving = (np.abs(states[:, :, 1 + model.njnt + free]) > DRIFT_SHARE * span).any(-1)
     last = np.where(moving.any(1), steps - moving[:, ::-1].argmax(1), 0)
     times = tuple(round(float(i * model.opt.timestep), 3) if i < late else None for i in last)
-    drift = float(np.ptp(states[:, late:, 1], axis=1).max()) / span
+    drift = float((np.ptp(states[:, late:, 1 + free], axis=1) / span).max())
     # MuJoCo's potential energy is gravity's; gravcomp carries its share of it.
     carried = 1.0 - float(model.body_gravcomp[model.jnt_bodyid[0]])
     energy = energies[:, :, 1] + carried * energies[:, :, 0]
     # A stationary start has no energy of its own to compare with: what a slow motion over the range has, serves.
-    slow = 0.5 / float(model.dof_invweight0[0]) * (0.1 * span) ** 2
+    slow = float(np.min(0.5 / model.dof_invweight0[free] * (0.1 * span) ** 2))
     start = energy[:, :1]
     growth = float(((energy - start) / np.maximum(np.abs(energies[:, :1, 1]), slow)).max())
     return times, drift, max(growth, 0.0)
 
 
 def round_trips(asset: Asset) -> tuple[tuple[str, ...], list[str]]:
-    """Formats that came back with the same joint, axis, limits and mass; and what is wrong with the others."""
-    from taa_envs.exports import export_asset
+    """Formats that came back with the same joint, axis, limits and mass; and what is wrong with the others.
+
+    A format that cannot hold the object's joints is in neither.
+    """
+    from taa_envs.exports import cannot_hold, export_asset
     from taa_envs.exports.check import check_export
 
     good, words = [], []
     for kind in ("mjcf", "urdf"):
+        if cannot_hold(asset, kind):
+            continue
         with tempfile.TemporaryDirectory(prefix="taa-gate-") as folder:
             target = export_asset(asset, kind, Path(folder) / kind)
             wrong = check_export(asset, kind, target)

@@ -40,7 +40,7 @@ def residual_translation(asset: Asset, size: float) -> float:
     the object's size about a hinge); within :data:`TRANSLATION`.
     """
     std = randomize.uncertainties(asset)
-    lever = size if asset.joint_type == "revolute" else abs(asset.demo["q_demo_end"] - asset.demo["q_start"])
+    lever = size if asset.joint_type != "prismatic" else abs(asset.demo["q_demo_end"] - asset.demo["q_start"])
     spread = np.sqrt(std.get("hand", 0.0)**2 + std.get("point", 0.0)**2 + (std.get("axis", 0.0) * lever)**2)
     return float(np.clip(3 * spread, *TRANSLATION))
 
@@ -165,7 +165,7 @@ class Layout:
         """(size,) factors on raw numbers: strokes, rad or m a second, m, m/s, N."""
         asset = scene.asset
         stroke = asset.demo["q_demo_end"] - asset.demo["q_start"]
-        lever = scene.size if asset.joint_type == "revolute" else 1.0
+        lever = scene.size if asset.joint_type != "prismatic" else 1.0
         out = np.zeros(self.size)
         out[self.at["joint"]] = 1.0, asset.demo["duration"] / stroke, LAG
         out[self.at["hand"]] = [1 / scene.size] * 63 + [1.0] * 3
@@ -200,7 +200,7 @@ def _in_the_link(scene: Scene) -> np.ndarray:
     reference = scene.asset.reference
     out = np.empty((len(reference.time), len(TIPS), 3))
     for i, (q, joints) in enumerate(zip(reference.q, reference.hand_joints, strict=True)):
-        data.qpos[scene.qpos] = q
+        scene.put(data.qpos, q)
         mujoco.mj_kinematics(scene.model, data)
         out[i] = (joints[list(TIPS)] - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
     return out

@@ -120,10 +120,11 @@ def draw(rng: np.random.Generator, std: Mapping[str, float], axis: np.ndarray, p
                 factor["frictionloss"], normal[8:11] * std.get("hand", 0.0) / np.sqrt(3))
 
 
-def write(fields: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], made: Draw, joint: int, body: int,
-          dof: int) -> None:
+def write(fields: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], made: Draw, joints: list[int],
+          body: int, dof: int) -> None:
     """Write a draw into model fields, relative to what they were; ``before`` holds copies of them."""
-    fields["jnt_axis"][joint], fields["jnt_pos"][joint] = made.axis, made.point
+    fields["jnt_axis"][joints] = made.axis
+    fields["jnt_pos"][joints[0]] = made.point
     for name in ("body_mass", "body_inertia"):
         fields[name][body] = before[name][body] * made.mass
     fields["dof_damping"][dof] = before["dof_damping"][dof] * made.damping

@@ -95,7 +95,8 @@ class Rollouts:
         start, stop = float(reference.time[0]), asset.end_time + HOLD
         everyone = np.arange(n)
         rows.clear(everyone)
-        rows.qpos[:, scene.qpos] = asset.demo["q_start"]
+        scene.put(rows.qpos, asset.demo["q_start"])
+        scene.put_further(rows.qpos, start)
         hand.place(everyone, np.stack([path.at(start) for path in paths]))
         rows.forward(everyone)
         edges = np.append(reference.time[:end + 1], stop)

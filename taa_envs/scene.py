@@ -1,9 +1,11 @@
 """Scenes: asset + hand + floor + lights + cameras, compiled. The only place that builds one.
 
-Who touches whom: the hand touches the moving link and nothing else. Not itself (its spheres are free of each other),
-not the floor, and by default not the static link: much of a static link is assumed (nobody saw its back), a monocular
-hand is off by centimetres, and a hand that catches on a surface nobody saw would fail for a reason that is not in the
-video. ``touch_static=True`` lets it touch. The links do not touch each other: the joint's range is the stop.
+Who touches whom: the hand touches the moving link (and an object's further moving links, which are as passive as the
+first; only the first's joint is the task, and only what touches that link counts as contact) and nothing else. Not
+itself (its spheres are free of each other), not the floor, and by default not the static link: much of a static link is
+assumed (nobody saw its back), a monocular hand is off by centimetres, and a hand that catches on a surface nobody saw
+would fail for a reason that is not in the video. ``touch_static=True`` lets it touch. The links do not touch each other:
+the joint's range is the stop.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taa_envs.asset import Asset
+from taa_envs.checks import numbered
 from taa_envs.errors import AssetError
 from taa_envs.hands import Controller, Hand, make_hand
 from taa_envs.hands.landmarks import SIDES, side_of
@@ -36,6 +39,8 @@ class Scene:
         asset: what it shows.  model: ``mujoco.MjModel``.
         hand: controller bound to the model, None in a scene without a hand.
         qpos, dof: addresses of the object's joint.
+        advance: of a screw, the address in ``qpos`` of the slide that follows the joint, and metres a radian.
+        further: addresses in ``qpos`` of ``joint_2`` and so on, and of the slides that follow those that are screws.
         hand_geoms, moving_geoms: (ngeom,) bool.
         surface: (P, 3) points of the moving link's collision surface in its own frame, m.
         centre: (3,) and size: m, of the bounding box of both links at q = 0.
@@ -51,6 +56,23 @@ class Scene:
     surface: np.ndarray
     centre: np.ndarray
     size: float
+    advance: tuple[int, float] | None = None
+    further: tuple[tuple[int, tuple[int, float] | None], ...] = ()
+
+    def put(self, qpos: np.ndarray, q: float | np.ndarray) -> None:
+        """Write the object's joint at q into states (..., nq), the slide that follows a screw with it."""
+        qpos[..., self.qpos] = q
+        if self.advance is not None:
+            qpos[..., self.advance[0]] = self.advance[1] * np.asarray(q)
+
+    def put_further(self, qpos: np.ndarray, time: float) -> None:
+        """Write the further joints as the demonstration has them at a time, s, into states (..., nq)."""
+        reference = self.asset.reference
+        for (column, advance), states in zip(self.further, reference.further, strict=True):
+            q = float(np.interp(time, reference.time, states))
+            qpos[..., column] = q
+            if advance is not None:
+                qpos[..., advance[0]] = advance[1] * q
 
 
 def _mesh_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int | np.integer) -> np.ndarray:
@@ -61,18 +83,29 @@ def _mesh_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int | np.inte
 
 
 def _bounds(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """(2, 3) box at q = 0, and (2, 3) box over the joint's range, of all mesh geoms."""
+    """(2, 3) box at q = 0, and (2, 3) box over the joints' ranges, of all mesh geoms."""
     import mujoco
 
     data = mujoco.MjData(model)
     boxes = []
-    for q in (0.0, *np.linspace(model.jnt_range[0, 0], model.jnt_range[0, 1], 7)):
-        data.qpos[0] = q
+    free = model.jnt_limited.astype(bool)
+    # All joints together: each link's own box is what counts, and no link is carried by another.
+    for q in (np.zeros(model.njnt), *np.linspace(model.jnt_range[:, 0], model.jnt_range[:, 1], 7)):
+        data.qpos[free] = q[free]
+        follow_screws(model, data.qpos)
         mujoco.mj_kinematics(model, data)
         points = np.concatenate([_mesh_points(model, data, g) for g in range(model.ngeom) if model.geom_dataid[g] >= 0])
         boxes.append([points.min(0), points.max(0)])
     boxes = np.array(boxes)
     return boxes[0], np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+
+
+def follow_screws(model: mujoco.MjModel, qpos: np.ndarray) -> None:
+    """Write the slides that follow screws into states (..., nq) of an object's own model."""
+    for e in range(model.neq):
+        slide, turn = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        pitch = model.eq_data[e, 1]
+        qpos[..., model.jnt_qposadr[slide]] = pitch * qpos[..., model.jnt_qposadr[turn]]
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
@@ -185,7 +218,7 @@ def build_spec(asset: Asset, hand: Hand | None, *, touch_static: bool = False) -
         raise AssetError(f"{asset.model_path} does not compile: {str(error)[:200]}") from None
     centre, size = box.mean(0), float(np.linalg.norm(box[1] - box[0]))
     spec.modelname = f"TAA/{asset.id}"
-    for name, bit in (("static", STATIC_BIT), ("moving", MOVING_BIT)):
+    for name, bit in (("static", STATIC_BIT), *((name, MOVING_BIT) for name in asset.links)):
         for geom in spec.body(name).geoms:
             if geom.contype or geom.conaffinity:
                 geom.contype, geom.conaffinity = bit, 0
@@ -228,7 +261,7 @@ def build_spec(asset: Asset, hand: Hand | None, *, touch_static: bool = False) -
         hand.attach(spec)
         for geom in spec.geoms:
             solid = geom.contype or geom.conaffinity
-            if solid and geom.parent.name not in ("static", "moving", "world"):
+            if solid and geom.parent.name not in ("static", *asset.links, "world"):
                 geom.contype, geom.conaffinity = 0, MOVING_BIT | (STATIC_BIT if touch_static else 0)
     return spec
 
@@ -260,12 +293,22 @@ def build_scene(asset: Asset, hand: str | Hand | None = "points", *, touch_stati
     touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    points = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(moving | static)])
+    others = np.isin(model.geom_bodyid, [model.body(name).id for name in asset.links[1:]])
+    points = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(moving | others | static)])
     box = np.stack([points.min(0), points.max(0)])
     surface = np.concatenate([_mesh_points(model, data, g) for g in np.flatnonzero(moving & touching)])
     if len(surface) > 500:
         surface = surface[np.linspace(0, len(surface) - 1, 500).astype(int)]
     return Scene(asset=asset, model=model, hand=None if made is None else made.bind(model),
                  qpos=int(model.joint("joint").qposadr[0]), dof=int(model.joint("joint").dofadr[0]),
-                 hand_geoms=touching & ~moving & ~static, moving_geoms=touching & moving, surface=surface,
-                 centre=box.mean(0), size=float(np.linalg.norm(box[1] - box[0])))
+                 hand_geoms=touching & ~moving & ~others & ~static, moving_geoms=touching & moving, surface=surface,
+                 centre=box.mean(0), size=float(np.linalg.norm(box[1] - box[0])),
+                 advance=_advance(model, 1, asset.joint),
+                 further=tuple((int(model.joint(numbered("joint", k)).qposadr[0]), _advance(model, k, joint))
+                               for k, joint in enumerate(asset.further, 2)))
+
+
+def _advance(model: mujoco.MjModel, link: int, joint: dict) -> tuple[int, float] | None:
+    if joint["type"] != "screw":
+        return None
+    return int(model.joint(numbered("advance", link)).qposadr[0]), float(joint["pitch"])

@@ -78,6 +78,7 @@ class Simulation:
         self._mujoco = mujoco
         self._contact_rows = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
         self._force = np.zeros(scene.model.nv)
+        self._advance = None if scene.advance is None else int(scene.model.joint("advance").dofadr[0])
         # MuJoCo resets a state that is not finite and counts it here.
         self._bad = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 
@@ -93,7 +94,8 @@ class Simulation:
     def reset(self, q: float, joints: np.ndarray) -> None:
         """Start of an episode: the joint at q and at rest, the hand at landmarks (21, 3)."""
         self._mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[self.scene.qpos] = q
+        self.scene.put(self.data.qpos, q)
+        self.scene.put_further(self.data.qpos, float(self.scene.asset.reference.time[0]))
         if self.scene.hand is not None:
             self.scene.hand.place(self.data, joints)
         self._mujoco.mj_forward(self.model, self.data)
@@ -105,7 +107,9 @@ class Simulation:
             return 0.0
         forces = np.where(d.efc_type >= self._contact_rows, d.efc_force, 0.0)
         self._mujoco.mj_mulJacTVec(self.model, d, self._force, forces)
-        return float(self._force[self.scene.dof])
+        force = float(self._force[self.scene.dof])
+        # The work of a screw's link is done along its advance too.
+        return force if self._advance is None else force + self.scene.asset.pitch * float(self._force[self._advance])
 
     def _touching(self) -> tuple[bool, float]:
         """Whether the hand pushes on the moving link, and how deep they overlap, m."""

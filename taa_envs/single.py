@@ -120,6 +120,8 @@ class SingleTask(Task):
             torque = (x * (k * (total[4] + gzy - gyz) - py * fz + pz * fy)
                       + y * (k * (total[5] + gxz - gzx) - pz * fx + px * fz)
                       + z * (k * (total[6] + gyx - gxy) - px * fy + py * fx))
+            if self._pitch:
+                torque += self._pitch * (fx * x + fy * y + fz * z)
         else:
             torque = fx * x + fy * y + fz * z
         self._push[0] = 1.0, fx, fy, fz, torque

@@ -70,11 +70,12 @@ class Task:
         rate = np.linalg.norm(np.diff(self._joints, axis=0), axis=-1) / np.diff(self._times)[:, None]
         self._stride = float(max(HAND_SPEED, 1.5 * rate.max())) * CONTROL_PERIOD  # m an environment step
         joint = model.joint("joint")
-        self._ids = (joint.id, model.body("moving").id, scene.dof)
+        joints = [joint.id] if scene.advance is None else [joint.id, model.joint("advance").id]
+        self._ids = (joints, model.body("moving").id, scene.dof)
         self.range = tuple(model.jnt_range[joint.id])
         self._before = {name: getattr(model, name).copy() for name in MODEL_FIELDS}
         self._nominal = randomize.nominal(self.asset, model.jnt_axis[joint.id], model.jnt_pos[joint.id])
-        self._hinge = self.asset.joint_type == "revolute"
+        self._hinge, self._pitch = self.asset.joint_type != "prismatic", self.asset.pitch
         self._draws = [self._nominal] * self.n
         surface = scene.surface[np.linspace(0, len(scene.surface) - 1, SURFACE).astype(int)]
         # |a - b|^2 = |a|^2 + (a, 1) (-2 b, |b|^2): one product for all pairs
@@ -168,7 +169,8 @@ class Task:
         joints = self.path(np.array(time)) + self._offset[row]
         self._aim[row] = self._hand.targets(joints)
         self.rows.clear(ids)
-        self.rows.qpos[row, self.scene.qpos] = q0
+        self.scene.put(self.rows.qpos[row], q0)
+        self.scene.put_further(self.rows.qpos[row], time)
         self._hand.place(ids, joints[None])
         self.rows.forward(ids)
 
@@ -250,6 +252,8 @@ class Task:
                                 g[:, 0, 2] - g[:, 2, 0] - p[:, 2] * force[:, 0] + p[:, 0] * force[:, 2],
                                 g[:, 1, 0] - g[:, 0, 1] - p[:, 0] * force[:, 1] + p[:, 1] * force[:, 0]], -1)
         load = ((torque if self._hinge else force) * self._axis).sum(-1)
+        if self._pitch:  # a screw's link does work along its advance too
+            load += self._pitch * (force * self._axis).sum(-1)
         return np.concatenate([(force * force).sum(-1, keepdims=True) > 0, force, load[:, None]], 1)
 
     def _mark(self, before: np.ndarray, contact: np.ndarray) -> None:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from taa_envs.asset import Asset
+from taa_envs.checks import numbered
+from taa_envs.scene import follow_screws
 
 if TYPE_CHECKING:
     import mujoco
@@ -64,7 +66,7 @@ def serve(asset: Asset, port: int = 8080) -> Viewer:
     server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     server.scene.set_up_direction("+z")
     frames = {}
-    for name in ("static", "moving"):
+    for name in ("static", *asset.links):
         frames[name] = server.scene.add_frame(f"/{name}", show_axes=False)
     corners = []
     for geom in spec.geoms:
@@ -92,6 +94,10 @@ def serve(asset: Asset, port: int = 8080) -> Viewer:
 
     def pose() -> None:
         data.qpos[0] = q.value
+        for k, states in enumerate(reference.further, 2):  # where the demonstration has them at that time
+            here = model.joint(numbered("joint", k)).qposadr[0]
+            data.qpos[here] = float(np.interp(time.value, reference.time, states))
+        follow_screws(model, data.qpos)
         mujoco.mj_kinematics(model, data)
         for name, frame in frames.items():
             body = model.body(name).id

@@ -16,6 +16,16 @@ from taa_envs.errors import TaaEnvsError
 FORMATS = ("mjcf", "urdf", "usd")
 
 
+def cannot_hold(asset: Asset, kind: str) -> str | None:
+    """Why a format cannot hold an asset's joints; None where it can."""
+    joints = (asset.joint, *asset.further)
+    if kind != "mjcf" and any(joint["type"] == "screw" for joint in joints):
+        return (f"{kind.upper()} has no screw joint: it cannot couple a turn to an advance; export mjcf instead")
+    if kind == "usd" and len(joints) > 1:
+        return f"the USD export holds one joint, this object has {len(joints)}; export mjcf or urdf instead"
+    return None
+
+
 def export_asset(asset: Asset, kind: str, target: Path) -> Path:
     """Write ``target/`` (made here, must not exist).
 
@@ -34,6 +44,8 @@ def export_asset(asset: Asset, kind: str, target: Path) -> Path:
     writers: dict[str, Callable[[Asset, Path], Path]] = {"mjcf": _write_mjcf, "urdf": write_urdf, "usd": write_usd}
     if kind not in writers:
         raise TaaEnvsError(f"unknown format {kind!r}; known: {', '.join(FORMATS)}")
+    if reason := cannot_hold(asset, kind):
+        raise TaaEnvsError(reason)
     target.mkdir(parents=True)
     return writers[kind](asset, target)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from taa_envs.asset import Asset
+from taa_envs.checks import numbered
 from taa_envs.errors import TaaEnvsError
 from taa_envs.exports.body import Inertial, Joint, inertial_of, joint_of, read_body
 
@@ -19,9 +20,17 @@ TOLERANCE = 1e-4
 class Loaded:
     """What a loader made of an export."""
 
-    joint: Joint
-    inertial: Inertial
+    joints: tuple[Joint, ...]
+    inertials: tuple[Inertial, ...]
     colliders: int
+
+    @property
+    def joint(self) -> Joint:
+        return self.joints[0]
+
+    @property
+    def inertial(self) -> Inertial:
+        return self.inertials[0]
 
 
 def load_mujoco(path: Path) -> Loaded:
@@ -33,10 +42,10 @@ def load_mujoco(path: Path) -> Loaded:
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(path))
-    if model.njnt != 1:
-        raise ValueError(f"{model.njnt} joints")
     solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    return Loaded(joint_of(model), inertial_of(model), int(solid.sum()))
+    jointed = [k for k in range(model.njnt) if model.jnt_limited[k]]
+    return Loaded(tuple(joint_of(model, k) for k in jointed), tuple(inertial_of(model, k) for k in jointed),
+                  int(solid.sum()))
 
 
 def load_usd(path: Path) -> Loaded:
@@ -74,8 +83,8 @@ def load_usd(path: Path) -> Loaded:
     turn = Rotation.from_quat([*p.GetImaginary(), p.GetReal()]).as_matrix()
     tensor = turn @ np.diag(np.array(mass.GetDiagonalInertiaAttr().Get())) @ turn.T
     colliders = sum(prim.HasAPI(UsdPhysics.CollisionAPI) for prim in stage.Traverse())
-    return Loaded(joint, Inertial(float(mass.GetMassAttr().Get()), np.array(mass.GetCenterOfMassAttr().Get()), tensor),
-                  colliders)
+    inertial = Inertial(float(mass.GetMassAttr().Get()), np.array(mass.GetCenterOfMassAttr().Get()), tensor)
+    return Loaded((joint,), (inertial,), colliders)
 
 
 def check_export(asset: Asset, kind: str, path: Path) -> list[str]:
@@ -92,20 +101,31 @@ def check_export(asset: Asset, kind: str, path: Path) -> list[str]:
     except ValueError as error:
         return [f"it does not load: {str(error)[:200]}"]
     body = read_body(asset.model_path)
-    want = Loaded(body.joint, body.inertial, sum(s.collides for s in body.shapes))
-    size = max(float(np.linalg.norm(body.inertial.centre - body.joint.point)), 1e-3)
+    if len(got.joints) != len(body.joints):
+        return [f"it does not load: {len(got.joints)} joints, were {len(body.joints)}"]
+    solid = sum(s.collides for s in body.shapes)
+    wrong = [] if got.colliders == solid else [f"colliders {got.colliders}, was {solid}"]
+    for k in range(len(body.joints)):
+        where = "" if k == 0 else f" of {numbered('joint', k + 1)}"
+        wrong += [line + where for line in _changed(got.joints[k], body.joints[k], got.inertials[k], body.inertials[k])]
+    return wrong
+
+
+def _changed(got: Joint, want: Joint, mass: Inertial, was: Inertial) -> list[str]:
+    """One line a difference."""
+    size = max(float(np.linalg.norm(was.centre - want.point)), 1e-3)
     pairs = [
-        ("axis", got.joint.axis, want.joint.axis, 1.0),
-        ("point", _foot(got.joint), _foot(want.joint), size),
-        ("limits", got.joint.limits, want.joint.limits, want.joint.limits[1] - want.joint.limits[0]),
-        ("damping", got.joint.damping, want.joint.damping, want.joint.damping),
-        ("friction", got.joint.friction, want.joint.friction, want.joint.friction),
-        ("mass", got.inertial.mass, want.inertial.mass, want.inertial.mass),
-        ("centre of mass", got.inertial.centre, want.inertial.centre, size),
-        ("inertia", got.inertial.tensor, want.inertial.tensor, float(np.trace(want.inertial.tensor))),
-        ("colliders", got.colliders, want.colliders, 1e-3),
+        ("axis", got.axis, want.axis, 1.0),
+        ("point", _foot(got), _foot(want), size),
+        ("pitch", got.pitch, want.pitch, abs(want.pitch)),
+        ("limits", got.limits, want.limits, want.limits[1] - want.limits[0]),
+        ("damping", got.damping, want.damping, want.damping),
+        ("friction", got.friction, want.friction, want.friction),
+        ("mass", mass.mass, was.mass, was.mass),
+        ("centre of mass", mass.centre, was.centre, size),
+        ("inertia", mass.tensor, was.tensor, float(np.trace(was.tensor))),
     ]
-    wrong = [] if got.joint.kind == want.joint.kind else [f"joint type {got.joint.kind}, was {want.joint.kind}"]
+    wrong = [] if got.kind == want.kind else [f"joint type {got.kind}, was {want.kind}"]
     for name, a, b, scale in pairs:
         if np.abs(np.asarray(a, float) - np.asarray(b, float)).max() > TOLERANCE * max(scale, 1e-9):
             wrong.append(f"{name} {np.round(a, 6).tolist()}, was {np.round(b, 6).tolist()}")
@@ -114,4 +134,4 @@ def check_export(asset: Asset, kind: str, path: Path) -> list[str]:
 
 def _foot(joint: Joint) -> np.ndarray:
     """The axis' point nearest to the origin: any point on the axis is the same joint."""
-    return joint.point - (joint.point @ joint.axis) * joint.axis if joint.kind == "revolute" else np.zeros(3)
+    return joint.point - (joint.point @ joint.axis) * joint.axis if joint.kind != "prismatic" else np.zeros(3)

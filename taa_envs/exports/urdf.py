@@ -1,4 +1,4 @@
-"""URDF: two links and a joint. https://wiki.ros.org/urdf/XML"""
+"""URDF: links and joints. https://wiki.ros.org/urdf/XML"""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from taa_envs.asset import Asset
-from taa_envs.errors import TaaEnvsError
-from taa_envs.exports.body import Body, Shape, read_body
+from taa_envs.exports.body import Body, Inertial, Joint, Shape, read_body
 
 EFFORT, VELOCITY = 1000.0, 100.0
 """URDF demands these two bounds; nothing in a video measures them, so they are out of the way."""
@@ -21,14 +20,7 @@ def _numbers(values: np.ndarray | list[float]) -> str:
 
 
 def write_urdf(asset: Asset, folder: Path) -> Path:
-    """``<id>.urdf`` and ``meshes/``; the moving link's frame is on the joint, so that URDF's joint origin is the point.
-
-    Raises:
-        TaaEnvsError: URDF has no joint of this type.
-    """
-    if asset.joint_type not in ("revolute", "prismatic"):
-        raise TaaEnvsError(f"URDF has no {asset.joint_type} joint: it cannot couple a turn to a slide; "
-                           "export mjcf instead")
+    """``<id>.urdf`` and ``meshes/``; moving links' frames are on their joints: URDF's joint origins are the points."""
     body = read_body(asset.model_path)
     (folder / "meshes").mkdir()
     robot = ET.Element("robot", name=asset.id)
@@ -41,31 +33,32 @@ def write_urdf(asset: Asset, folder: Path) -> Path:
         if shape.texture is not None and not shape.collides:
             material = ET.SubElement(robot, "material", name=shape.name)
             ET.SubElement(material, "texture", filename=f"meshes/{shape.texture.name}")
-    for link in ("static", "moving"):
-        _add_link(robot, link, body, folder)
-    joint = body.joint
-    element = ET.SubElement(robot, "joint", name="joint", type=joint.kind)
-    ET.SubElement(element, "origin", xyz=_numbers(joint.point), rpy="0 0 0")
-    ET.SubElement(element, "parent", link="static")
-    ET.SubElement(element, "child", link="moving")
-    ET.SubElement(element, "axis", xyz=_numbers(joint.axis))
-    ET.SubElement(element, "limit", lower=f"{joint.limits[0]:.9g}", upper=f"{joint.limits[1]:.9g}",
-                  effort=f"{EFFORT:g}", velocity=f"{VELOCITY:g}")
-    ET.SubElement(element, "dynamics", damping=f"{joint.damping:.9g}", friction=f"{joint.friction:.9g}")
+    _add_link(robot, "static", None, None, body, folder)
+    for link, joint, inertial in zip(body.links, body.joints, body.inertials, strict=True):
+        _add_link(robot, link, joint, inertial, body, folder)
+        element = ET.SubElement(robot, "joint", name=link.replace("moving", "joint"), type=joint.kind)
+        ET.SubElement(element, "origin", xyz=_numbers(joint.point), rpy="0 0 0")
+        ET.SubElement(element, "parent", link="static")
+        ET.SubElement(element, "child", link=link)
+        ET.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        ET.SubElement(element, "limit", lower=f"{joint.limits[0]:.9g}", upper=f"{joint.limits[1]:.9g}",
+                      effort=f"{EFFORT:g}", velocity=f"{VELOCITY:g}")
+        ET.SubElement(element, "dynamics", damping=f"{joint.damping:.9g}", friction=f"{joint.friction:.9g}")
     ET.indent(robot)
     path = folder / f"{asset.id}.urdf"
     path.write_text('<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n", encoding="utf-8")
     return path
 
 
-def _add_link(robot: ET.Element, name: str, body: Body, folder: Path) -> None:
-    frame = body.joint.point if name == "moving" else np.zeros(3)
+def _add_link(robot: ET.Element, name: str, joint: Joint | None, mass: Inertial | None, body: Body,
+              folder: Path) -> None:
+    frame = joint.point if joint is not None else np.zeros(3)
     link = ET.SubElement(robot, "link", name=name)
-    if name == "moving":
+    if mass is not None:
         inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "origin", xyz=_numbers(body.inertial.centre - frame), rpy="0 0 0")
-        ET.SubElement(inertial, "mass", value=f"{body.inertial.mass:.9g}")
-        t = body.inertial.tensor
+        ET.SubElement(inertial, "origin", xyz=_numbers(mass.centre - frame), rpy="0 0 0")
+        ET.SubElement(inertial, "mass", value=f"{mass.mass:.9g}")
+        t = mass.tensor
         ET.SubElement(inertial, "inertia", ixx=f"{t[0, 0]:.9g}", ixy=f"{t[0, 1]:.9g}", ixz=f"{t[0, 2]:.9g}",
                       iyy=f"{t[1, 1]:.9g}", iyz=f"{t[1, 2]:.9g}", izz=f"{t[2, 2]:.9g}")
     for collides, tag in ((False, "visual"), (True, "collision")):

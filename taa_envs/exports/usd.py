@@ -17,10 +17,8 @@ def write_usd(asset: Asset, folder: Path) -> Path:
     """``<id>.usda`` and ``textures/``: metres, kilograms, z up; /<id>/static, /<id>/moving, /<id>/joint.
 
     Raises:
-        TaaEnvsError: usd-core is not installed, or UsdPhysics has no joint of this type.
+        TaaEnvsError: usd-core is not installed.
     """
-    if asset.joint_type not in ("revolute", "prismatic"):
-        raise TaaEnvsError(f"UsdPhysics has no {asset.joint_type} joint; export mjcf instead")
     try:
         from pxr import Gf, Usd, UsdGeom, UsdPhysics
     except ImportError:

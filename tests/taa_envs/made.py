@@ -1,4 +1,4 @@
-"""Procedural assets: a door pulled by its handle, the same door pushed from behind, and a drawer."""
+"""Procedural assets: a door pulled by its handle, the same door pushed from behind, a drawer, two of them, a screw."""
 
 from __future__ import annotations
 
@@ -48,8 +48,9 @@ def demonstration_arrays(joint: dict, grip: np.ndarray, approach: np.ndarray, q_
     axis = np.array(joint["axis"], float)
     for i, (t, angle) in enumerate(zip(time, q, strict=True)):
         points = grip + approach * (1 - min_jerk(t / 0.55))
-        if joint["type"] == "revolute":
+        if joint["type"] != "prismatic":
             hand[i] = Rotation.from_rotvec(angle * axis).apply(points - joint["point"]) + joint["point"]
+            hand[i] += angle * (joint["pitch"] or 0.0) * axis
         else:
             hand[i] = points + angle * axis
     if noise:
@@ -103,3 +104,30 @@ def drawer_arguments(noise: float = 0.0, seed: int = 0) -> dict:
     grip = hooked_hand() @ np.diag([-1.0, -1.0, 1.0]) + [0.015, -0.031, 0.2]
     return {"joint": joint, "moving": moving, "static": static,
             "reference": demonstration_arrays(joint, grip, np.array([-0.15, 0.01, 0.0]), 0.25, noise=noise, seed=seed)}
+
+
+def chest_arguments() -> dict:
+    """The drawer with a second one above it, which the demonstration has opened before it touches the first."""
+    from taa_envs.mechanism import FurtherLink
+
+    made = drawer_arguments()
+    static = link(box((-0.22, 0.03, 0.0), (0.22, 0.4, 0.09), WALL), box((-0.22, 0.03, 0.31), (0.22, 0.4, 0.33), WALL),
+                  box((-0.22, 0.03, 0.56), (0.22, 0.4, 0.58), WALL))  # fmt: skip
+    moving = link(box((-0.2, 0.0, 0.35), (0.2, 0.02, 0.55), WOOD), box((-0.18, 0.02, 0.36), (0.18, 0.35, 0.37), WOOD))
+    time = made["reference"]["time"]
+    joint = {**made["joint"], "axis": [0.0, -1.0, 0.0]}
+    return {**made, "static": static, "further": [FurtherLink(joint, moving, 0.1 * min_jerk(time / 0.5))]}
+
+
+def valve_arguments(pitch: float = 0.01) -> dict:
+    """A valve's cross handle on a vertical thread: two rad of turning raise it by two pitches."""
+    joint = {"verdict": "ok", "reason": "made", "type": "screw", "axis": [0.0, 0.0, 1.0], "point": [0.0, 0.0, 0.3],
+             "pitch": pitch, "std": {"axis_deg": 1.0, "point_m": 0.002, "pitch": 0.001, "q": None},
+             "scale_source": "given"}  # fmt: skip
+    moving = link(box((-0.15, -0.01, 0.3), (0.15, 0.01, 0.32), STEEL),
+                  box((0.13, -0.01, 0.32), (0.15, 0.01, 0.38), WOOD))
+    static = link(box((-0.05, -0.05, 0.0), (0.05, 0.05, 0.28), WALL))
+    grip = hooked_hand() @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T
+    grip = grip - grip[8] + [0.14, -0.017, 0.35]
+    return {"joint": joint, "moving": moving, "static": static,
+            "reference": demonstration_arrays(joint, grip, np.array([0.0, -0.15, 0.0]), 2.0)}
