@@ -80,7 +80,7 @@ def with_reference(asset: Asset, name: str, hand: str) -> Asset:
         same = False
     if not same:
         raise AssetError(f"{file} was not refined from this demonstration; {how}")
-    reference = _read_reference(file)
+    reference = replace(_read_reference(file, 0), further=asset.reference.further)
     if len(reference.time) != len(asset.reference.time):
         raise AssetError(f"{file} has {len(reference.time)} frames, the demonstration {len(asset.reference.time)}; "
                          f"{how}")

@@ -4,8 +4,8 @@ Who touches whom: the hand touches the moving link (and an object's further movi
 first; only the first's joint is the task, and only what touches that link counts as contact) and nothing else. Not
 itself (its spheres are free of each other), not the floor, and by default not the static link: much of a static link is
 assumed (nobody saw its back), a monocular hand is off by centimetres, and a hand that catches on a surface nobody saw
-would fail for a reason that is not in the video. ``touch_static=True`` lets it touch. The links do not touch each other:
-the joint's range is the stop.
+would fail for a reason that is not in the video. ``touch_static=True`` lets it touch. The links do not touch each
+other: the joint's range is the stop.
 """
 
 from __future__ import annotations

@@ -28,7 +28,8 @@ class Joint:
     """The passive joint, asset frame at q = 0.
 
     Attributes:
-        kind: "revolute", "prismatic" or "screw".  pitch: m/rad of a screw.  axis: (3,) unit.  point: (3,) m on the axis (the origin for a slide).
+        kind: "revolute", "prismatic" or "screw".  axis: (3,) unit.  pitch: m/rad of a screw.
+        point: (3,) m on the axis (the origin for a slide).
         limits: rad or m.  damping, friction: N m s/rad and N m, or N s/m and N.
     """
 
