@@ -40,7 +40,7 @@ def mirror_plane(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
     asset = scene.asset
     data = mujoco.MjData(scene.model)
-    data.qpos[scene.qpos] = asset.demo["q_start"]
+    scene.put(data.qpos, asset.demo["q_start"])
     mujoco.mj_kinematics(scene.model, data)
     mujoco.mj_comPos(scene.model, data)
     centre = data.xipos[scene.model.body("moving").id].copy()
@@ -75,14 +75,15 @@ def carried(asset: Asset, x: np.ndarray, by: np.ndarray) -> np.ndarray:
     if asset.joint_type == "prismatic":
         return x + by[:, None, None] * axis
     point = np.array(asset.joint["point"], float)
-    return np.einsum("tij,tnj->tni", Rotation.from_rotvec(by[:, None] * axis).as_matrix(), x - point) + point
+    turned = np.einsum("tij,tnj->tni", Rotation.from_rotvec(by[:, None] * axis).as_matrix(), x - point) + point
+    return turned + asset.pitch * by[:, None, None] * axis
 
 
 def _start(scene: Scene, grip: np.ndarray) -> float:
     """rad or m, in the demonstrated direction, by which a hand in this grip (21, 3) must be moved on to be clear of the
     link at rest: the least that is looked at, and one more for clearance. The largest where none is clear (a knob)."""
     asset = scene.asset
-    away = ANGLES if asset.joint_type == "revolute" else SLIDES * scene.size
+    away = SLIDES * scene.size if asset.joint_type == "prismatic" else ANGLES
     sign = 1.0 if asset.demo["q_demo_end"] > asset.demo["q_start"] else -1.0
     sim = Simulation(scene)
     blocked = True
