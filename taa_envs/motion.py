@@ -1,28 +1,23 @@
-"""The demonstrated hand as an action changes it: looked up by the reference's clock, corrected, observed.
+"""The demonstrated hand as an action changes it, and what of it is observed: the tables that a step looks things up in.
 
-Written so that one simulation, in Python's floats, and many, in arrays, round alike: a batched episode then is the
-single one to the last bit.
+:mod:`taa_envs.kernels` does the looking up.
 """
 
 from __future__ import annotations
-
-from bisect import bisect_left
-from typing import Any
 
 import numpy as np
 
 from taa_envs import randomize
 from taa_envs.asset import Asset
+from taa_envs.kernels import CORRECTIONS, TIPS, turn_and_shift
 from taa_envs.scene import Scene
 
 ROTATION, CLOSURE = 0.3, 0.5  # rad, share of the way: corrections of an action of 1
 TRANSLATION = (0.03, 0.15)  # m, least and most that an action of 1 shifts the hand by
 PACE = 1.5  # the reference's clock runs at 1 + PACE * action seconds a second: from -0.5 to 2.5
 SLEW = 0.2  # of an action of 1: the fastest that a correction changes in one step
-CORRECTIONS = 7  # translation, rotation, closing
 RESIDUALS = CORRECTIONS + 1  # and the pace
 PALM = (0, 5, 9, 13, 17)
-TIPS = (4, 8, 12, 16, 20)
 # How far along its finger each landmark is: closing moves tips all the way, knuckles not at all.
 CURL = np.array([0, 0, 1, 2, 3] + [0, 1, 2, 3] * 4) / 3.0
 PREVIEW = (0.1, 0.3)  # s ahead
@@ -45,25 +40,6 @@ def residual_translation(asset: Asset, size: float) -> float:
     return float(np.clip(3 * spread, *TRANSLATION))
 
 
-def turn_and_shift(x: Any, y: Any, z: Any, palm: Any, shift: Any) -> tuple:
-    """The twelve numbers, row by row, of the (4, 3) matrix that takes points (..., 4), ones last, to points turned
-    about the palm and shifted.
-
-    Args:
-        x, y, z: the turn: its axis times ``2 tan(angle / 2)`` (Cayley's formula needs no sine, whose last bit would
-            depend on the library), rad for small turns; floats or arrays (n,).
-        palm, shift: three of the same each, m.
-    """
-    x, y, z = 0.5 * x, 0.5 * y, 0.5 * z
-    s = 2.0 / (1.0 + x * x + y * y + z * z)
-    a, b, c = 1.0 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y)
-    d, e, f = s * (x * y + z), 1.0 - s * (x * x + z * z), s * (y * z - x)
-    g, h, i = s * (x * z - y), s * (y * z + x), 1.0 - s * (x * x + y * y)
-    p, q, r = palm
-    return (a, d, g, b, e, h, c, f, i, p - (a * p + b * q + c * r) + shift[0], q - (d * p + e * q + f * r) + shift[1],
-            r - (g * p + h * q + i * r) + shift[2])
-
-
 def apply_residual(joints: np.ndarray, action: np.ndarray, translation: float = TRANSLATION[0]) -> np.ndarray:
     """Landmarks (..., 21, 3) m, closed, turned about the palm and shifted by actions (..., 7 or more); leading axes
     broadcast. translation: m that an action of 1 shifts by."""
@@ -77,71 +53,15 @@ def apply_residual(joints: np.ndarray, action: np.ndarray, translation: float = 
     return moved @ matrix[..., :3, :] + matrix[..., 3:, :]
 
 
-class Table:
-    """Rows (T, K) at times (T,) s, linear between them, the first before and the last after."""
-
-    def __init__(self, times: np.ndarray, rows: np.ndarray) -> None:
-        self.rows, self._times, self._gaps = rows, times, np.diff(times)
-        self._slopes = np.diff(rows, axis=0)
-        self._last, self._list, self._gap_list = len(times) - 2, times.tolist(), self._gaps.tolist()
-        self._out = np.empty(rows.shape[1])
-
-    def one(self, t: float) -> np.ndarray:
-        """(K,) at t; overwritten by the next call."""
-        i = min(max(bisect_left(self._list, t) - 1, 0), self._last)
-        w = min(max((t - self._list[i]) / self._gap_list[i], 0.0), 1.0)
-        np.multiply(self._slopes[i], w, self._out)
-        return np.add(self._out, self.rows[i], self._out)
-
-    def many(self, t: np.ndarray) -> np.ndarray:
-        """(n, K) at t (n,)."""
-        i = np.minimum(np.maximum(self._times.searchsorted(t) - 1, 0), self._last)
-        w = np.minimum(np.maximum((t - self._times[i]) / self._gaps[i], 0.0), 1.0)
-        return self._slopes[i] * w[:, None] + self.rows[i]
-
-
-class Motion:
-    """A demonstration's tables for a hand whose ``S`` targets are ``weights @ landmarks``.
-
-    Attributes:
-        aims: targets as (S, 4) with ones, their change by closing as (S, 4) with zeros, and the palm's centre (3,).
-        shown: what an observation adds to its scaled numbers, see :class:`Layout`.
-    """
-
-    def __init__(self, scene: Scene, weights: np.ndarray, layout: Layout) -> None:
-        reference = scene.asset.reference
-        joints, times = reference.hand_joints, reference.time
-        means = _MEANS @ joints
-        self.count = len(weights)
-        base, curl = (np.zeros((len(times), self.count, 4)) for _ in range(2))
-        base[..., :3], base[..., 3] = weights @ joints, 1.0
-        curl[..., :3] = weights @ (CLOSURE * CURL[:, None] * (means[:, :1] - joints))
-        self.aims = Table(times, np.concatenate([base.reshape(len(times), -1), curl.reshape(len(times), -1),
-                                                 means[:, 1]], 1))
-        self.shown = Table(times, layout.shift(scene))
-
-    def one(self, t: float, correction: list[float], translation: float, offset: list[float], matrix: np.ndarray
-            ) -> np.ndarray:
-        """(S, 3) targets at t under corrections (7,) in [-1, 1] and a shift (3,) m; matrix: (4, 3) to work in."""
-        row, half = self.aims.one(t), 4 * self.count
-        tx, ty, tz, x, y, z, close = correction
-        u, v, w = offset
-        matrix.flat = turn_and_shift(ROTATION * x, ROTATION * y, ROTATION * z, row[2 * half:].tolist(),
-                                     (translation * tx + u, translation * ty + v, translation * tz + w))
-        points = row[:half]
-        if close:
-            points += close * row[half:2 * half]
-        return points.reshape(self.count, 4) @ matrix
-
-    def many(self, t: np.ndarray, correction: np.ndarray, translation: float, offset: np.ndarray) -> np.ndarray:
-        """(n, S, 3): the same for n, with t (n,), corrections (n, 7) and shifts (n, 3)."""
-        rows, half, n = self.aims.many(t), 4 * self.count, len(t)
-        c = correction.T
-        shift = [translation * c[k] + offset[:, k] for k in range(3)]
-        numbers = turn_and_shift(ROTATION * c[3], ROTATION * c[4], ROTATION * c[5], rows[:, 2 * half:].T, shift)
-        matrix = np.stack(numbers, -1).reshape(n, 4, 3)
-        points = rows[:, :half] + c[6][:, None] * rows[:, half:2 * half]
-        return points.reshape(n, self.count, 4) @ matrix
+def aim_table(scene: Scene, weights: np.ndarray) -> np.ndarray:
+    """(T, 8 S + 3), at the reference's frames, for a hand whose S targets are ``weights @ landmarks``: targets as
+    (S, 4), their change by closing as (S, 4) (their last numbers are not used), and the palm's centre (3,), m."""
+    joints = scene.asset.reference.hand_joints
+    means = _MEANS @ joints
+    base, curl = (np.zeros((len(joints), len(weights), 4)) for _ in range(2))
+    base[..., :3] = weights @ joints
+    curl[..., :3] = weights @ (CLOSURE * CURL[:, None] * (means[:, :1] - joints))
+    return np.concatenate([base.reshape(len(joints), -1), curl.reshape(len(joints), -1), means[:, 1]], 1)
 
 
 class Layout:

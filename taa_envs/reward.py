@@ -9,14 +9,13 @@ penetration    minus the overlap of hand and link beyond 5 mm, in units of 5 mm,
 success        1 in a step in which the episode's state is a success
 =============  ========================================================================================
 
-``"sparse_goal"`` has no terms: its reward is :func:`goal_reward`, 0 where the goal is reached and -1 elsewhere.
+:func:`taa_envs.kernels.raw_terms` computes them. ``"sparse_goal"`` has no terms: its reward is :func:`goal_reward`, 0
+where the goal is reached and -1 elsewhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from math import tanh
 
 import numpy as np
 
@@ -33,21 +32,6 @@ DRIVEN_SHARE = 0.8  # of the progress made, what contact must have driven for a 
 GOAL = (1.0, DRIVEN_SHARE)
 
 
-@dataclass(frozen=True)
-class RewardInputs:
-    """What a step did, each a number or an array (n,): fractions of the stroke, whether the hand pushed, m, the actions
-    (..., A) now and before, and whether the state is a success."""
-
-    driven: np.ndarray | float
-    moved: np.ndarray | float
-    contact: np.ndarray | bool
-    distance: np.ndarray | float
-    penetration: np.ndarray | float
-    action: np.ndarray
-    previous_action: np.ndarray
-    success: np.ndarray | bool
-
-
 def reward_scales(reward: str | Mapping[str, float]) -> dict[str, float]:
     """Scales of a named reward, or those given.
 
@@ -62,45 +46,6 @@ def reward_scales(reward: str | Mapping[str, float]) -> dict[str, float]:
     if unknown:
         raise ValueError(f"no reward term is named {', '.join(sorted(unknown))}; known: {', '.join(TERMS)}")
     return {name: float(value) for name, value in reward.items()}
-
-
-def reward_terms(step: RewardInputs, scales: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Term name -> scaled value (of the inputs' shape), of the terms that have a scale."""
-    out: dict[str, np.ndarray] = {}
-    for name, scale in scales.items():
-        if name == "progress":
-            raw = step.driven + np.minimum(step.moved, 0.0)
-        elif name == "reach":
-            raw = np.where(step.contact, 0.0, -np.tanh(np.asarray(step.distance) / REACH_SCALE))
-        elif name == "action_rate":
-            change = np.asarray(step.action, float) - step.previous_action
-            raw = -np.mean(change * change, axis=-1)
-        elif name == "penetration":
-            over = (np.asarray(step.penetration, float) - FREE_PENETRATION) / FREE_PENETRATION
-            raw = -np.minimum(np.maximum(over, 0.0), 1.0)
-        else:
-            raw = np.asarray(step.success, float)
-        out[name] = scale * raw
-    return out
-
-
-def scalar_terms(driven: float, moved: float, contact: bool, distance: float, penetration: float, action: list[float],
-                 previous_action: list[float], success: bool, scales: Mapping[str, float]) -> dict[str, float]:
-    """:func:`reward_terms` of one step, in Python's numbers; inputs as in :class:`RewardInputs`."""
-    out: dict[str, float] = {}
-    for name, scale in scales.items():
-        if name == "progress":
-            raw = driven + min(moved, 0.0)
-        elif name == "reach":
-            raw = 0.0 if contact else -tanh(distance / REACH_SCALE)
-        elif name == "action_rate":
-            raw = -sum([(a - b) * (a - b) for a, b in zip(action, previous_action, strict=True)]) / len(action)
-        elif name == "penetration":
-            raw = -min(max((penetration - FREE_PENETRATION) / FREE_PENETRATION, 0.0), 1.0)
-        else:
-            raw = float(success)
-        out[name] = scale * raw
-    return out
 
 
 def goal_reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:

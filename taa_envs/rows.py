@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from taa_envs import kernels
 from taa_envs.hands import Controller
 from taa_envs.hands.points import PointsController
 from taa_envs.scene import CONTROL_PERIOD, SUBSTEPS, Scene, touch_history
@@ -18,11 +19,7 @@ from taa_envs.scene import CONTROL_PERIOD, SUBSTEPS, Scene, touch_history
 if TYPE_CHECKING:
     import mujoco
 
-_MEAN = np.full(21, 1 / 21)
-
 # Model fields that an episode may change, see taa_envs.randomize.
-BAD = slice(3, 6)
-"""Of the kinds of MuJoCo's warnings (mjtWarning), those of a state that is not finite: it then begins anew."""
 MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping", "dof_frictionloss")
 
 
@@ -30,7 +27,7 @@ class Rows(Protocol):
     """``n`` simulations. Arrays are live: ``qpos`` (n, nq), ``qvel`` (n, nv), ``act`` (n, na), ``ctrl`` (n, nu),
     ``time`` (n,); of the state before the last step ``sensordata`` (n, nsensordata), ``link_pos`` (n, 3) and
     ``link_mat`` (n, 3, 3) of the moving link; ``touches`` (n, SUBSTEPS, 10), what :func:`taa_envs.scene.touch_history`
-    finds."""
+    finds; ``warnings`` (n, kinds) int32, how often MuJoCo warned since it began anew."""
 
     n: int
     qpos: np.ndarray
@@ -41,14 +38,11 @@ class Rows(Protocol):
     link_mat: np.ndarray
     touches: np.ndarray
     sensordata: np.ndarray
+    warnings: np.ndarray
 
     @property
     def time(self) -> np.ndarray:
-        """(n,) s of simulation."""
-
-    @property
-    def warnings(self) -> np.ndarray:
-        """(n, kinds) how often MuJoCo warned since it began anew; a copy."""
+        """(n,) s of simulation; good until the next step."""
 
     def fields(self, row: int) -> Mapping[str, np.ndarray]:
         """Model fields of one simulation, to write into; call :meth:`constants` afterwards."""
@@ -96,15 +90,13 @@ class SingleRows:
         self.sensordata, body = self.data.sensordata[None], scene.model.body("moving").id
         self.link_pos, self.link_mat = self.data.xpos[None, body], self.data.xmat[None, body].reshape(1, 3, 3)
         self.touches = _touches(scene, self.data.history[None])
+        self.warnings, self._time = self.data.warning.number[None], np.zeros(1)
         self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
 
     @property
     def time(self) -> np.ndarray:
-        return np.array([self.data.time])
-
-    @property
-    def warnings(self) -> np.ndarray:
-        return np.array([self.data.warning.number])
+        self._time[0] = self.data.time
+        return self._time
 
     def fields(self, row: int) -> dict[str, np.ndarray]:
         return {name: getattr(self.model, name) for name in MODEL_FIELDS}
@@ -148,16 +140,12 @@ class BatchRows:
         self.link_pos = self.batch.bind("xpos")[:, body]
         self.link_mat = self.batch.bind("xmat")[:, body].reshape(n, 3, 3)
         self.touches = _touches(scene, self.batch.bind("history"))
-        self._time, self._warning = self.batch.bind("time"), self.batch.warning
+        self._time, self.warnings = self.batch.bind("time").reshape(n), self.batch.warning[..., 1]
         self._model: dict[str, np.ndarray] = {}
 
     @property
     def time(self) -> np.ndarray:
         return self._time.copy()
-
-    @property
-    def warnings(self) -> np.ndarray:
-        return self._warning[..., 1].copy()
 
     def fields(self, row: int) -> dict[str, np.ndarray]:
         if not self._model:  # only where models differ: expanded fields are copied at every step
@@ -192,7 +180,7 @@ class PointsRows:
 
     def __init__(self, controller: PointsController, rows: Rows) -> None:
         self.weights, self.hand, self._rows = controller.weights, controller.hand, rows
-        count, self._damping = len(self.weights), controller.hand.damping
+        count = len(self.weights)
 
         def view(array: np.ndarray, columns: np.ndarray) -> np.ndarray:
             first = int(columns[0, 0])
@@ -203,9 +191,13 @@ class PointsRows:
             return out
 
         self._here, self._speed = view(rows.qpos, controller.qpos), view(rows.qvel, controller.dof)
-        self._velocity, self._target = view(rows.ctrl, controller.act), view(rows.act, controller.target)
-        self._pull, self._drag = np.empty((count, 3)), np.empty((count, 3))
-        self._flat = self._pull.reshape(-1)
+        self._velocity, self._target = view(rows.ctrl, controller.ctrl), view(rows.act, controller.target)
+        self._landmarks, self._landmark_speed = self._here[:, :21], self._speed[:, :21]
+        self._states = self._here, self._speed, self._target, self._velocity
+        hand, self._everyone = controller.hand, np.arange(rows.n)
+        self._jump, self._glide = (
+            np.array([hand.stiffness, hand.damping, ahead, hand.sphere_force, hand.total_force, rate])
+            for ahead, rate in ((0.0, 0.0), (CONTROL_PERIOD, 1 / CONTROL_PERIOD)))
 
     def targets(self, joints: np.ndarray) -> np.ndarray:
         """(..., S, 3) sphere targets of landmarks (..., 21, 3), m."""
@@ -218,92 +210,55 @@ class PointsRows:
 
     def control(self, target: np.ndarray) -> None:
         """Aim at targets (n, S, 3) m within the limits of each sphere and of the whole hand, for one substep."""
-        self._target[:] = self._within(target, 0.0)
-        self._velocity[:] = 0.0
+        kernels.drive(self._everyone, target, *self._states, self._jump)
 
-    def advance(self, before: np.ndarray, target: np.ndarray, ids: np.ndarray | None) -> None:
-        """One environment step, in which the targets move evenly to targets (n, S, 3) m; before: the last ones.
+    def advance(self, target: np.ndarray, ids: np.ndarray | None) -> None:
+        """One environment step, in which the targets move evenly to targets (n, S, 3) m.
 
         The whole hand's limit holds for the forces at the step's end as they can be foreseen, each sphere going on as
         fast as it goes: where it binds, the targets move to where the hand just keeps it.
         """
-        self._velocity[:] = (self._within(target, CONTROL_PERIOD) - self._target) * (1 / CONTROL_PERIOD)
+        kernels.drive(self._everyone if ids is None else ids, target, *self._states, self._glide)
         self._rows.step(ids, SUBSTEPS)
-
-    def _within(self, target: np.ndarray, ahead: float) -> np.ndarray:
-        """Targets (n, S, 3), drawn in where the hand's forces would add up to too much after so many s."""
-        hand, limit = self.hand, self.hand.sphere_force
-        drag = (hand.stiffness * ahead + self._damping) * self._speed
-        pull = (target - self._here) * hand.stiffness
-        pull -= drag
-        np.maximum(np.minimum(pull, limit, out=pull), -limit, out=pull)
-        square = pull * pull
-        # Sums written out: their rounding must not depend on how many simulations there are.
-        total = np.sqrt(square[..., 0] + square[..., 1] + square[..., 2]).sum(-1)
-        if total.max() <= hand.total_force:
-            return target
-        share = (hand.total_force / np.maximum(total, hand.total_force))[:, None, None]
-        return np.where(share < 1.0, self._here + (pull * share + drag) / hand.stiffness, target)
-
-    def advance_one(self, before: np.ndarray, target: np.ndarray) -> None:
-        """:meth:`advance` of the only simulation, targets (S, 3), with less around the arithmetic."""
-        hand, pull, drag = self.hand, self._pull, self._drag
-        np.subtract(target, self._here[0], pull)
-        np.multiply(pull, hand.stiffness, pull)
-        np.multiply(self._speed[0], hand.stiffness * CONTROL_PERIOD + self._damping, drag)
-        np.subtract(pull, drag, pull)
-        flat = self._flat
-        # The sum of S lengths is at most sqrt(S) times the root of the sum of their squares.
-        if len(pull) * float(flat @ flat) > hand.total_force**2:
-            np.minimum(pull, hand.sphere_force, out=pull)
-            np.maximum(pull, -hand.sphere_force, out=pull)
-            square = pull * pull
-            total = float(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]).sum())
-            if total > hand.total_force:
-                np.multiply(pull, hand.total_force / total, pull)
-                np.add(pull, drag, pull)
-                np.divide(pull, hand.stiffness, pull)
-                target = np.add(self._here[0], pull, pull)
-        velocity = self._velocity[0]
-        np.subtract(target, self._target[0], velocity)
-        np.multiply(velocity, 1 / CONTROL_PERIOD, velocity)
-        self._rows.step(None, SUBSTEPS)
 
     def landmarks(self) -> np.ndarray:
         """(n, 21, 3) m; a view of the states."""
-        return self._here[:, :21]
+        return self._landmarks
 
     def velocity(self) -> np.ndarray:
-        """(n, 3) m/s, mean of the landmarks'."""
-        return _MEAN @ self._speed[:, :21]
+        """(n, 21, 3) m/s, of the landmarks; a view of the states."""
+        return self._landmark_speed
 
 
 class ControllerRows:
-    """Any other hand, one simulation only, through its :class:`taa_envs.hands.Controller`; targets are landmarks."""
+    """Any other hand, one simulation only, through its :class:`taa_envs.hands.Controller`; targets are landmarks.
+
+    Attributes:
+        aim: (21, 3) m, the landmarks that the last step ended aiming at.
+    """
 
     def __init__(self, controller: Controller, rows: SingleRows) -> None:
         self.weights = np.eye(21)
         self._controller, self._rows, self._data = controller, rows, rows.data
-        self._velocity = np.zeros((1, 3))
+        self._velocity, self.aim = np.zeros((1, 21, 3)), np.zeros((21, 3))
 
     def targets(self, joints: np.ndarray) -> np.ndarray:
         return joints
 
     def place(self, ids: np.ndarray, joints: np.ndarray) -> None:
         self._controller.place(self._data, joints[0])
+        self.aim = joints[0].copy()
 
     def control(self, target: np.ndarray) -> None:
         self._controller.control(self._data, target[0])
 
-    def advance(self, before: np.ndarray, target: np.ndarray, ids: np.ndarray | None) -> None:
-        """One environment step, in which the landmarks aimed at move evenly from one (1, 21, 3) m to another."""
-        self.advance_one(before[0], target[0])
-
-    def advance_one(self, before: np.ndarray, target: np.ndarray) -> None:
-        way = target - before
+    def advance(self, target: np.ndarray, ids: np.ndarray | None) -> None:
+        """One environment step, in which the landmarks aimed at move evenly to others (1, 21, 3) m."""
+        way = target[0] - self.aim
         for k in range(SUBSTEPS):
-            self._controller.control(self._data, before + (k / SUBSTEPS) * way)
+            self._controller.control(self._data, self.aim + (k / SUBSTEPS) * way)
             self._rows.step(None)
+        self.aim = target[0].copy()
 
     def landmarks(self) -> np.ndarray:
         return self._controller.landmarks(self._data)[None]

@@ -131,3 +131,15 @@ def valve_arguments(pitch: float = 0.01) -> dict:
     grip = grip - grip[8] + [0.14, -0.017, 0.35]
     return {"joint": joint, "moving": moving, "static": static,
             "reference": demonstration_arrays(joint, grip, np.array([0.0, -0.15, 0.0]), 2.0)}
+
+
+def terms(**changed: object) -> dict[str, float]:
+    """Reward terms before their scales, of a step in which nothing happens but for what is changed."""
+    from taa_envs.kernels import raw_terms
+    from taa_envs.reward import FREE_PENETRATION, REACH_SCALE, TERMS
+
+    step = {"driven": 0.0, "moved": 0.0, "contact": False, "distance": 0.05, "penetration": 0.0, "action": np.zeros(7),
+            "previous_action": np.zeros(7), "success": False}
+    out = np.empty(len(TERMS))
+    raw_terms(*{**step, **changed}.values(), REACH_SCALE, FREE_PENETRATION, out)
+    return dict(zip(TERMS, out.tolist(), strict=True))

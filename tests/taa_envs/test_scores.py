@@ -8,43 +8,39 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taa_envs.asset import Asset
-from taa_envs.reward import RewardInputs, reward_scales, reward_terms
+from taa_envs.env import ArticulationEnv
+from taa_envs.reward import reward_scales
 from taa_envs.scoring import score_actions, score_joint_log
-
-STILL = np.zeros(7)
-
-
-def inputs(**changes: object) -> RewardInputs:
-    values = {"driven": 0.0, "moved": 0.0, "contact": True, "distance": 0.0, "penetration": 0.0, "action": STILL,
-              "previous_action": STILL, "success": False}
-    return RewardInputs(**(values | changes))
-
-
-ONES = {name: 1.0 for name in ("progress", "reach", "action_rate", "penetration", "success")}
+from tests.taa_envs.made import terms
 
 
 def test_motion_without_contact_earns_nothing() -> None:
-    assert reward_terms(inputs(moved=0.1, contact=False), ONES)["progress"] == 0.0
-    assert reward_terms(inputs(moved=0.1, driven=0.1), ONES)["progress"] == pytest.approx(0.1)
+    assert terms(moved=0.1)["progress"] == 0.0
+    assert terms(moved=0.1, driven=0.1)["progress"] == pytest.approx(0.1)
 
 
 def test_motion_the_wrong_way_costs() -> None:
-    assert reward_terms(inputs(moved=-0.1), ONES)["progress"] == pytest.approx(-0.1)
+    assert terms(moved=-0.1)["progress"] == pytest.approx(-0.1)
 
 
 def test_reach_costs_more_the_farther_the_hand() -> None:
-    far, near = (reward_terms(inputs(contact=False, distance=d), ONES)["reach"] for d in (0.5, 0.05))
-    assert -1 < far < near < 0 == reward_terms(inputs(), ONES)["reach"]
+    far, near = (terms(distance=d)["reach"] for d in (0.5, 0.05))
+    assert -1 < far < near < 0 == terms(contact=True)["reach"]
 
 
 @given(st.floats(0, 1))
 def test_penetration_is_bounded(depth: float) -> None:
-    assert -1 <= reward_terms(inputs(penetration=depth), ONES)["penetration"] <= 0
+    assert -1 <= terms(penetration=depth)["penetration"] <= 0
 
 
-def test_scales_select_and_weigh() -> None:
-    assert reward_terms(inputs(success=True), reward_scales("sparse")) == {"success": 1.0}
-    assert reward_terms(inputs(success=True), reward_scales({"success": 3})) == {"success": 3.0}
+def test_scales_select_and_weigh(door: Asset) -> None:
+    for reward, wanted in (("sparse", {"success": 1.0}), ({"success": 3}, {"success": 3.0})):
+        env = ArticulationEnv(door, reward=reward)
+        env.reset(seed=0)
+        done = False
+        while not done:
+            _, total, done, _, info = env.step(np.zeros(8))
+        assert info["reward_terms"] == wanted and total == sum(wanted.values())
     with pytest.raises(ValueError, match="known: dense, sparse"):
         reward_scales("generous")
     with pytest.raises(ValueError, match="known: progress"):

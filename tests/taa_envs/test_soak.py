@@ -9,7 +9,7 @@ import pytest
 from benchmarks.soak import soak
 from taa_envs.asset import Asset
 from taa_envs.env import ArticulationEnv
-from taa_envs.rows import BAD
+from taa_envs.kernels import BAD
 from taa_envs.vector import BatchedArticulationEnv
 
 
@@ -26,7 +26,8 @@ def test_a_warning_of_mujoco_is_in_info(door: Asset, tmp_path, monkeypatch: pyte
     zero = np.zeros(env.action_space.shape, np.float32)
     assert env.step(zero)[-1]["warnings"] == 0
     kinds = mujoco.mjtWarning
-    assert list(range(7))[BAD] == [int(k) for k in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
+    bad = kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC
+    assert [BAD, BAD + 1, BAD + 2] == [int(k) for k in bad]
     env.data.qvel[3] = np.nan
     _, _, terminated, _, info = env.step(zero)
     assert info["warnings"] >= 1 and info["diverged"] and terminated
