@@ -31,9 +31,10 @@ NUMBERS = CORRECTION + CORRECTIONS
 RESULTS = TERMS + 5
 
 # Task._constants: the joint's states at start and end of the demonstration, its range; m of a translation; s by which
-# targets lead; columns of q and its rate; of the least distance in sensordata; whether it turns, and m it
-# advances a radian; whether the finger tips' distance is wanted; whether actions are residual; columns of the observation; s of a step; rad of a rotation;
-# the clock's and the corrections' speed; what makes a success; the reward's lengths, m.
+# targets lead; columns of q and its rate; of the least distance in sensordata; whether the joint turns, and m that it
+# advances a radian; whether the finger tips' distance is wanted; whether actions are residual; columns of the
+# observation; s of a step; rad of a rotation; the clock's and the corrections' speed; what makes a success; the
+# reward's lengths, m.
 (Q_START, Q_END, Q_RANGE, TRANSLATION, LEAD, Q_COLUMN, V_COLUMN, DEPTH_COLUMN, TURNS, PITCH, REACH, RESIDUAL, O_HAND,
  O_CONTACT, O_ERROR, O_GRIP, O_ACTION, PERIOD, ROTATION, PACE, SLEW, ENOUGH, DRIVEN_ENOUGH, REACH_LENGTH,
  FREE_DEPTH) = range(25)  # fmt: skip
