@@ -529,7 +529,7 @@ def evaluate(asset_id: str, policy: Path, episodes: int, seed: int, video: Path 
     if video is not None and not video.parent.is_dir():
         raise TaaEnvsError(f"no such folder: {video.parent}; make it first")
     from train.evaluate import evaluate as run
-    from train.evaluate import record
+    from train.film import record
 
     data = run(asset, policy, episodes, seed=seed)
     if video is not None:

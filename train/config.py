@@ -23,6 +23,8 @@ class Config:
         envs, steps, checkpoint_every: simulations at once, environment steps in all, and between checkpoints.
         reward, action, randomize: of the environment.
         hold: environment steps for which the policy's action is held.
+        evaluate_every, evaluate_episodes, enough: environment steps between evaluations without exploration (0: none),
+            episodes of one, and the success at which training ends.
         algorithm, policy: arguments of the Stable-Baselines3 class and of its policy.
     """
 
@@ -34,6 +36,9 @@ class Config:
     action: str = "residual"
     randomize: bool = True
     hold: int = 5
+    evaluate_every: int = 0
+    evaluate_episodes: int = 64
+    enough: float = 1.0
     seed: int = 0
     algorithm: Mapping[str, Any] = field(default_factory=dict)
     policy: Mapping[str, Any] = field(default_factory=dict)
@@ -59,12 +64,15 @@ def load_config(algo: str = "ppo", file: Path | None = None, **changes: Any) -> 
     except (ValueError, TypeError, RecursionError) as error:  # tomllib goes down by recursion, and knows bad dates
         reason = " ".join(str(error).split())[:120]
         raise TaaEnvsError(f"{file} does not hold training settings ({reason}); copy one of train/configs") from None
-    for name, most in (("envs", 65_536), ("steps", 10**12), ("checkpoint_every", 10**12)):
+    for name, least, most in (("envs", 1, 65_536), ("steps", 1, 10**12), ("checkpoint_every", 1, 10**12),
+                              ("evaluate_every", 0, 10**12), ("evaluate_episodes", 1, 10**6)):  # fmt: skip
         value = getattr(made, name)
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
-            raise TaaEnvsError(f"{name} must be a whole number from 1 to {most}, is {str(value)[:40]}; mend {file}")
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+            raise TaaEnvsError(f"{name} must be a whole number from {least} to {most}, is {str(value)[:40]}; "
+                               f"mend {file}")
     for name, kinds in (("reward", (str, dict)), ("action", (str,)), ("randomize", (bool, list, dict)),
-                        ("seed", (int,)), ("algorithm", (dict,)), ("policy", (dict,))):  # fmt: skip
+                        ("seed", (int,)), ("enough", (int, float)),
+                        ("algorithm", (dict,)), ("policy", (dict,))):  # fmt: skip
         if not isinstance(getattr(made, name), kinds):
             words = " or ".join(k.__name__ for k in kinds)
             raise TaaEnvsError(f"{name} must be {words}, is {str(getattr(made, name))[:40]!r}; mend {file}")

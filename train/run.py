@@ -33,31 +33,52 @@ from taa_envs.errors import TaaEnvsError
 from taa_envs.files import written_whole
 from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config
-from train.policy import CLASSES, arrays, load_torch, save_policy, save_torch, tensors
+from train.evaluate import episodes as run_episodes
+from train.evaluate import make_env
+from train.policy import CLASSES, Policy, arrays, load_torch, save_policy, save_torch, tensors
 from train.vec import BatchedVecEnv, Normal, replay_normal
 
-FORMAT = "taa-checkpoint/1"
-COLUMNS = ("steps", "episodes", "success", "return", "progress", "seconds", "processor")
+FORMAT = "taa-checkpoint/2"
+FREE = ("steps", "checkpoint_every", "evaluate_every", "evaluate_episodes", "enough")  # may differ when a run goes on
+COLUMNS = ("steps", "episodes", "success", "return", "progress", "evaluated", "seconds", "processor")
+EVALUATED = COLUMNS.index("evaluated")
 WINDOW = 100  # episodes that a row of the curve averages over
+WORTHWHILE = 0.8  # success in training, with exploration, from which on the policy is evaluated without
+EVALUATION_SEED = 500_000  # of an evaluation's first episode: not the training's, nor those of `taa evaluate`
 CHUNK = 2048  # environment steps between rows of SAC's curve; PPO has one a rollout
 
 
 class _Episodes(BaseCallback):
-    """Collects how episodes ended."""
+    """Collects how episodes ended, of those that began so long ago that none of them can be running any more.
 
-    def __init__(self) -> None:
+    A success ends early, a failure at the time limit: the first to end are successes, and an average over what has
+    ended would begin far too high.
+
+    Args:
+        longest: decisions in the longest episode.
+    """
+
+    def __init__(self, longest: int) -> None:
         super().__init__()
-        self.count = 0
+        self.longest = longest
+        self.now = self.count = 0
+        self.waiting: list[list[float]] = []  # when it began, success, return, progress
         self.last: deque[list[float]] = deque(maxlen=WINDOW)
 
     def _on_step(self) -> bool:
+        self.now += 1
         for info in self.locals["infos"]:
             if "episode" in info:
-                self.count += 1
-                self.last.append([float(info["is_success"]), info["episode"]["r"], info["joint_progress"]])
+                self.waiting.append([self.now - info["episode"]["l"], float(info["is_success"]), info["episode"]["r"],
+                                     info["joint_progress"]])
         return True
 
     def means(self) -> list[float]:
+        """Of success, return and progress."""
+        known = [e for e in self.waiting if e[0] <= self.now - self.longest]
+        self.waiting = [e for e in self.waiting if e[0] > self.now - self.longest]
+        self.count += len(known)
+        self.last.extend(e[1:] for e in sorted(known, key=lambda e: e[0]))
         return np.mean(self.last, axis=0).tolist() if self.last else [float("nan")] * 3
 
 
@@ -67,21 +88,23 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
 
     Args:
         asset: what to train on.
-        config: settings.  ``steps`` may be larger than the run's was: it then goes on.
+        config: settings.  ``steps`` may be larger than the run's was: it then goes on. With ``evaluate_every`` the
+            policy is evaluated without exploration as soon as it does well, and training ends where it does well
+            ``enough``.
         folder: the run's, made if missing.
         minutes: stop after so many by the clock, those before a kill counted in; the run can go on later.
         progress: called after every iteration with the share done and the curve's row.
 
     Returns:
-        run (path), policy (path), resumed_at (steps), steps, and the curve's last success, return, progress,
-        seconds by the clock and of the processor.
+        run (path), policy (path), resumed_at (steps), steps, and the curve's last success, return, progress, evaluated
+        (success without exploration), seconds by the clock and of the processor.
 
     Raises:
         TaaEnvsError: the folder holds a run with other settings, or something else.
     """
     folder = Path(folder)
     described = {"asset": asset.id, "model_sha256": hashlib.sha256(asset.model_path.read_bytes()).hexdigest(),
-                 **{k: v for k, v in config.as_dict().items() if k not in ("steps", "checkpoint_every")}}
+                 **{k: v for k, v in config.as_dict().items() if k not in FREE}}
     _claim(folder, described)
     batch = BatchedArticulationEnv(asset, config.envs, autoreset_mode="same_step", reward=config.reward,
                                    action=config.action, randomize=config.randomize, hold=config.hold)
@@ -101,7 +124,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     if config.algo == "ppo":  # begin as the replay: the mean action of a fresh policy is then zero
         with torch.no_grad():
             model.policy.action_net.weight.zero_()
-    episodes, rows = _Episodes(), []
+    episodes, rows = _Episodes(-(-batch.max_episode_steps // config.hold)), []
     chunk = config.envs * model.n_steps if config.algo == "ppo" else max(CHUNK // config.hold, config.envs)
     resumed, seconds, used = 0, 0.0, 0.0
     if content is not None:
@@ -109,28 +132,45 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         resumed, (seconds, used) = model.num_timesteps * config.hold, rows[-1][-2:] if rows else (0.0, 0.0)
         _write_results(folder, model, normal, config, asset, rows)  # the kill may have come before they were written
     begin, begin_used, saved, made = time.monotonic() - seconds, time.process_time() - used, resumed, resumed
-    over = made >= config.steps
+    trial: BatchedArticulationEnv | None = None
+    over = made >= config.steps or (bool(rows) and rows[-1][EVALUATED] >= config.enough)
     while not over:
         # The first call resets the environments, the others go on.
         model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
         made = model.num_timesteps * config.hold  # Stable-Baselines3 counts decisions
-        rows.append([made, episodes.count, *episodes.means(), time.monotonic() - begin,
+        means = episodes.means()
+        evaluated = float("nan")
+        if config.evaluate_every and means[0] >= WORTHWHILE and made - _evaluated_at(rows) >= config.evaluate_every:
+            if trial is None:
+                trial = make_env(asset, config.evaluate_episodes, action=config.action, randomize=config.randomize,
+                                 hold=config.hold)
+            evaluated = float(run_episodes(asset, Policy(model.policy, normal, config.hold), config.evaluate_episodes,
+                                           seed=EVALUATION_SEED, env=trial)["success"].mean())
+        rows.append([made, episodes.count, *means, evaluated, time.monotonic() - begin,
                      time.process_time() - begin_used])
         for name, value in zip(COLUMNS[1:], rows[-1][1:], strict=True):
             model.logger.record(f"taa/{name}", value)
         model.logger.dump(made)
         if progress is not None:
             progress(min(made / config.steps, 1.0), dict(zip(COLUMNS, rows[-1], strict=True)))
-        over = made >= config.steps or (minutes is not None and time.monotonic() - begin >= 60 * minutes)
+        over = (made >= config.steps or evaluated >= config.enough
+                or (minutes is not None and time.monotonic() - begin >= 60 * minutes))
         if made - saved >= config.checkpoint_every or over:
             save_torch(checkpoint, _checkpoint(model, env, normal, episodes, rows))
             _write_results(folder, model, normal, config, asset, rows)
             saved = made
     env.close()
+    if trial is not None:
+        trial.close()
     last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
     return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
             "steps": made,
             **{k: None if np.isnan(last[k]) else last[k] for k in COLUMNS[2:] if k in last}}
+
+
+def _evaluated_at(rows: list[list[float]]) -> float:
+    """Steps at which the policy was evaluated last."""
+    return max((row[0] for row in rows if np.isfinite(row[EVALUATED])), default=-np.inf)
 
 
 def _claim(folder: Path, described: dict) -> None:
@@ -180,7 +220,8 @@ def _checkpoint(model: BaseAlgorithm, env: BatchedVecEnv, normal: Normal, episod
         "normal": [normal.mean, normal.std],
         "torch": torch.get_rng_state(), "numpy": [state[1], state[2], state[3], state[4]],
         "actions": model.action_space.np_random.bit_generator.state,
-        "episodes": {"count": episodes.count, "last": [list(e) for e in episodes.last]}, "rows": rows,
+        "episodes": {"now": episodes.now, "count": episodes.count, "waiting": [list(e) for e in episodes.waiting],
+                     "last": [list(e) for e in episodes.last]}, "rows": rows,
     }
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
@@ -214,7 +255,8 @@ def _restore(model: BaseAlgorithm, env: BatchedVecEnv, episodes: _Episodes, cont
         buffer.pos, buffer.full = content["buffer"]["pos"], content["buffer"]["full"]
         for name in _BUFFER:
             getattr(buffer, name)[:len(content["buffer"][name])] = content["buffer"][name]
-    episodes.count = content["episodes"]["count"]
+    episodes.now, episodes.count = content["episodes"]["now"], content["episodes"]["count"]
+    episodes.waiting = content["episodes"]["waiting"]
     episodes.last.extend(content["episodes"]["last"])
     model.action_space.np_random.bit_generator.state = content["actions"]
     np.random.set_state(("MT19937", *content["numpy"]))  # noqa: NPY002

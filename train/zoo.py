@@ -3,14 +3,17 @@
     python -m train.zoo                                   # every shipped asset
     python -m train.zoo ID ... --seeds 0 1 2 --minutes 15 --out runs/zoo --page docs/zoo.md
 
-What is done stays done: a run that was killed goes on, and finished evaluations are read, not made again. A training
-run is allowed so many minutes by the clock of a machine on which nothing else is to run.
+One seed of every asset comes before the next seed, and the page is written after every run: what is there when it is
+stopped is a table of what was done. What is done stays done: a run that was killed goes on, and finished evaluations
+are read, not made again. A training run is allowed so many minutes by the clock of a machine on which nothing else is
+to run.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import json
 import platform
 from collections.abc import Sequence
@@ -46,25 +49,25 @@ class Entry:
         return wins / count, float(interval.low), float(interval.high)
 
 
-def make(asset: Asset, algo: str, seeds: Sequence[int], minutes: float, steps: int | None, episodes: int, out: Path
-         ) -> Entry:
-    """Train and evaluate what is not there yet."""
-    runs, curves = [], []
-    for seed in seeds:
-        folder = out / f"{asset.id}-{algo}-{seed}"
-        file = folder / "zoo.json"
-        wanted = {"minutes": minutes, "steps": steps, "episodes": episodes}
-        known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-        if known.get("wanted") != wanted:
-            trained = train(asset, load_config(algo, seed=seed, steps=steps), folder, minutes=minutes)
-            known = {"wanted": wanted, "trained": trained, **evaluate(asset, folder, episodes)}
-            with written_whole(file) as partial:
-                partial.write_text(json.dumps(known, indent=1), encoding="utf-8")
-        runs.append(known)
-        curves.append(folder / "curve.csv")
-        print(f"{asset.id} seed {seed}: {known['policy']['success']:.0%}, replay {known['replay']['success']:.0%}, "
-              f"{known['trained']['steps']} steps in {known['trained']['seconds']:.0f} s", flush=True)
-    return Entry(asset, runs, curves)
+def make(asset: Asset, algo: str, seed: int, minutes: float, steps: int | None, episodes: int, out: Path,
+         replay: dict[str, Any] | None = None) -> tuple[dict[str, Any], Path]:
+    """Train and evaluate unless that was done: the evaluation, with ``trained`` beside it, and the curve's file.
+
+    replay: of an evaluation of the same asset with as many episodes.
+    """
+    folder = out / f"{asset.id}-{algo}-{seed}"
+    file, model = folder / "zoo.json", hashlib.sha256(asset.model_path.read_bytes()).hexdigest()
+    wanted = {"minutes": minutes, "steps": steps, "episodes": episodes, "model_sha256": model}
+    known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    if known.get("wanted") != wanted:
+        trained = train(asset, load_config(algo, seed=seed, steps=steps), folder, minutes=minutes)
+        known = {"wanted": wanted, "trained": trained, **evaluate(asset, folder, episodes, replay=replay)}
+        with written_whole(file) as partial:
+            partial.write_text(json.dumps(known, indent=1), encoding="utf-8")
+    print(f"{asset.id} seed {seed}: {known['policy']['success']:.0%}, replay {known['replay']['success']:.0%}, "
+          f"{known['trained']['steps']} steps in {known['trained']['seconds']:.0f} s "
+          f"({known['trained']['processor']:.0f} s of processor)", flush=True)
+    return known, folder / "curve.csv"
 
 
 def table(entries: Sequence[Entry]) -> str:
@@ -90,12 +93,14 @@ def page(entries: Sequence[Entry], command: str, figure: str | None) -> str:
     lines = ["# Policy zoo", "",
              f"`{command}` trains and evaluates all of it (settings: `train/configs`). Success in {run['episodes']} "
              "episodes a seed under each asset's own randomisation, none of them seen in training, with 95 % Wilson "
-             "intervals; the replay runs in the same episodes. Interval and mean over all seeds do not say how seeds "
-             f"differ: their own column does. {platform.processor() or platform.machine()}, MuJoCo and "
+             "intervals; the replay runs in the same episodes. The intervals count episodes as if seeds were alike; "
+             f"how seeds differ is in their own column. {platform.processor() or platform.machine()}, MuJoCo and "
              "Stable-Baselines3 of the lock file.", "", table(entries), ""]
     if figure is not None:
         lines += [f"![Success in training over environment steps, a line a seed.]({figure})", "",
-                  "*With the noise that training explores with, over the last 100 episodes.*", ""]
+                  "*Lines: with the noise that training explores with, over 100 episodes (each counted once all that "
+                  "began with it have ended). Dots: evaluations without noise, the last of which ends the training "
+                  "when it is perfect; its episodes are not those of the table. Dashed: the replay.*", ""]
     return "\n".join(lines)
 
 
@@ -111,10 +116,12 @@ def draw(file: Path, entries: Sequence[Entry]) -> None:
     figure, axes = plt.subplots(rows, columns, figsize=(3.2 * columns, 2.4 * rows), squeeze=False, sharey=True,
                                 layout="constrained")
     for ax, entry in zip(axes.flat, entries, strict=False):
-        for curve in entry.curves:
+        for k, curve in enumerate(entry.curves):
             with curve.open(newline="", encoding="utf-8") as f:
-                points = [(float(r["steps"]) / 1000, float(r["success"])) for r in csv.DictReader(f)]
-            ax.plot(*zip(*points, strict=True), linewidth=1)
+                points = [[float(r[name]) for name in ("steps", "success", "evaluated")] for r in csv.DictReader(f)]
+            steps, success, evaluated = np.array(points).T
+            ax.plot(steps / 1000, success, linewidth=1, color=f"C{k}")
+            ax.plot(steps / 1000, evaluated, ".", markersize=5, color=f"C{k}")
         ax.axhline(entry.pooled("replay")[0], color="0.4", linestyle="--", linewidth=1)
         ax.set_title(entry.asset.id, fontsize=9)
         ax.set_ylim(0, 1)
@@ -142,19 +149,29 @@ def main(argv: Sequence[str] | None = None) -> None:
     ids = arguments.ids or [i for i, folder in sorted(find_assets().items()) if folder.resolve().parent == shipped]
     if not ids:
         parser.error("no asset ships with this version; name some")
-    entries = [make(get_asset(i), arguments.algo, arguments.seeds, arguments.minutes, arguments.steps,
-                    arguments.episodes, arguments.out) for i in ids]
+    entries = [Entry(get_asset(i), [], []) for i in ids]
+    command = "python -m train.zoo " + " ".join(
+        [*arguments.ids, f"--algo {arguments.algo}", "--seeds", *map(str, arguments.seeds),
+         f"--minutes {arguments.minutes:g}", f"--episodes {arguments.episodes}"]
+        + ([f"--steps {arguments.steps}"] if arguments.steps else []))
+    for seed in arguments.seeds:
+        for entry in entries:
+            run, curve = make(entry.asset, arguments.algo, seed, arguments.minutes, arguments.steps,
+                              arguments.episodes, arguments.out, entry.runs[0]["replay"] if entry.runs else None)
+            entry.runs.append(run)
+            entry.curves.append(curve)
+            if arguments.page is not None:
+                write_page(arguments.page, [e for e in entries if e.runs], command)
     print(table(entries))
-    if arguments.page is not None:
-        figure = arguments.page.parent / "images" / "zoo.png"
-        figure.parent.mkdir(parents=True, exist_ok=True)
-        draw(figure, entries)
-        command = "python -m train.zoo " + " ".join(
-            [*arguments.ids, f"--algo {arguments.algo}", "--seeds", *map(str, arguments.seeds),
-             f"--minutes {arguments.minutes:g}", f"--episodes {arguments.episodes}"]
-            + ([f"--steps {arguments.steps}"] if arguments.steps else []))
-        with written_whole(arguments.page) as partial:
-            partial.write_text(page(entries, command, "images/zoo.png"), encoding="utf-8")
+
+
+def write_page(file: Path, entries: Sequence[Entry], command: str) -> None:
+    """The page and its figure, ``images/zoo.png`` beside it."""
+    figure = file.parent / "images" / "zoo.png"
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    draw(figure, entries)
+    with written_whole(file) as partial:
+        partial.write_text(page(entries, command, "images/zoo.png"), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from taa_envs.asset import Asset
 from taa_envs.errors import TaaEnvsError
 from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config, load_config
-from train.evaluate import episodes, evaluate, record
+from train.evaluate import episodes, evaluate
+from train.film import record
 from train.policy import load_policy
 from train.run import train
 from train.vec import BatchedVecEnv
@@ -174,3 +176,46 @@ def test_video(door: Asset, tmp_path: Path) -> None:
     train(door, Config(**{**PPO.as_dict(), "steps": 256}), tmp_path / "run")
     record(door, tmp_path / "run", tmp_path / "a.mp4", count=1, height=96)
     assert (tmp_path / "a.mp4").stat().st_size > 5000
+
+
+def test_the_curve_does_not_begin_with_successes_alone(door: Asset) -> None:
+    """An average over what has ended is of early successes only; over what began long enough ago it is not."""
+    from train.run import _Episodes
+
+    episodes = _Episodes(longest=10)
+
+    def pass_by(*ended: tuple[bool, int]) -> None:
+        """One decision, in which episodes end: success, length."""
+        episodes.locals = {"infos": [{"episode": {"r": 0.0, "l": length}, "is_success": won, "joint_progress": 1.0}
+                                     for won, length in ended] or [{}]}
+        episodes._on_step()
+
+    for step in range(1, 10):
+        pass_by(*([(True, 5)] if step == 5 else []))
+        assert np.isnan(episodes.means()[0])  # a failure that began with that success may still be running
+    pass_by((False, 10), (True, 5))
+    assert episodes.means()[0] == 0.5 and episodes.count == 2  # the second success began later
+
+
+def test_training_ends_when_an_evaluation_is_good_enough(door: Asset, tmp_path: Path) -> None:
+    config = Config(**{**PPO.as_dict(), "steps": 100_000, "randomize": False, "evaluate_every": 1,
+                       "evaluate_episodes": 3, "policy": {"net_arch": [16], "log_std_init": -4.0}})
+    done = train(door, config, tmp_path / "run")  # hardly any noise, and nothing randomised: the replay, which succeeds
+    assert done["evaluated"] == 1.0 and done["steps"] < 5000
+    assert train(door, config, tmp_path / "run")["resumed_at"] == done["steps"]  # it stays ended
+    seen = [row for row in csv.DictReader((tmp_path / "run" / "curve.csv").open(encoding="utf-8"))]
+    assert [row["evaluated"] for row in seen[:-1]] == ["nan"] * (len(seen) - 1)
+
+
+def test_a_strip_shows_where_the_policy_wins(door: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from train import film
+
+    train(door, Config(**{**PPO.as_dict(), "steps": 256}), tmp_path / "run")
+    picture = np.zeros((20, 30, 3), np.uint8)
+    ends = {7: [True, True], 8: [False, False], 9: [True, False]}
+    monkeypatch.setattr(film, "_pairs", lambda asset, policy, action, seed, *_, **__: iter(
+        [([picture] * 2, [False, False])] * 8 + [([picture] * 2, ends[seed])]))
+    assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=2) is None
+    assert not (tmp_path / "a.png").exists()
+    assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=3) == 9
+    assert Image.open(tmp_path / "a.png").size == (5 * 30, 2 * 20)
