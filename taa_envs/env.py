@@ -128,9 +128,10 @@ class ArticulationEnv(gymnasium.Env, EzPickle):
     - ``q0``: joint state to start from, within its range, rad or m.
     - ``phase``: in [0, 1], start at this fraction of the demonstration; the joint starts where the demonstration had
       it, unless q0 says otherwise.
-    - ``randomize``: True draws axis, pivot, scale, mass, damping, friction and the hand's place from the asset's own
-      uncertainties (:mod:`taa_envs.randomize`); a list of names draws those; a dict of names gives the standard
-      deviations. What was drawn is in ``info["randomized"]``. The default is the argument ``randomize``.
+    - ``randomize``: True draws axis, pivot, scale, mass, damping, friction, the hand's place and, where the asset says
+      how well they are known, spring and armature from the asset's own uncertainties (:mod:`taa_envs.randomize`); a
+      list of names draws those; a dict of names gives the standard deviations. What was
+      drawn is in ``info["randomized"]``. The default is the argument ``randomize``.
 
     ## Info
     ``joint_progress``, ``final_q_error``, ``is_success`` (was one at some time of the episode), ``success_now``,

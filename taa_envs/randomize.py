@@ -1,9 +1,9 @@
 """Domain randomisation: what the reconstruction knows that it does not know.
 
 Every amount comes from the asset: the ``std`` of the entry of that name in its provenance. Nothing is drawn for a
-number that has none, but for the assumed forces and masses: a video carries no force, the asset says ``assumed``, and
-an assumption is taken to hold within a factor of two (:data:`ASSUMED_FACTOR`, one standard deviation), the one
-number here that no asset gives.
+number that has none, but for the assumed mass, damping and friction: a video carries no force, the asset says
+``assumed``, and an assumption is taken to hold within a factor of two (:data:`ASSUMED_FACTOR`, one standard deviation),
+the one number here that no asset gives. Spring and armature are drawn where a diagnosis has fitted them.
 
 ==============  ======================================  ================================================================
 name            standard deviation                      what is drawn
@@ -15,6 +15,9 @@ scale           ``scale`` std, relative                 the size of everything, 
 mass            ``moving.mass`` std / value             a factor on mass and inertia, log-normal
 damping         ``joint.damping`` std / value           a factor, log-normal
 frictionloss    ``joint.frictionloss`` std / value      a factor, log-normal
+stiffness       ``joint.stiffness`` std / value         a factor on the joint's spring, log-normal
+armature        ``joint.armature`` std / value          a factor, log-normal
+springref       ``joint.springref`` std, rad or m       a shift of where the spring is at rest
 hand            ``hand.offset`` std, m; where absent    a shift of the whole demonstrated hand against the object
                 that of ``joint.point``
 ==============  ======================================  ================================================================
@@ -29,17 +32,23 @@ import numpy as np
 
 from taa_envs.asset import Asset
 
-NAMES = ("axis", "point", "scale", "mass", "damping", "frictionloss", "hand")
+NAMES = ("axis", "point", "scale", "mass", "damping", "frictionloss", "hand", "stiffness", "armature", "springref")
 ASSUMED_FACTOR = 2.0
 _ENTRIES = {"axis": "joint.axis", "point": "joint.point", "scale": "scale", "mass": "moving.mass",
-            "damping": "joint.damping", "frictionloss": "joint.frictionloss", "hand": "hand.offset"}
+            "damping": "joint.damping", "frictionloss": "joint.frictionloss", "hand": "hand.offset",
+            "stiffness": "joint.stiffness", "armature": "joint.armature", "springref": "joint.springref"}
 _FACTORS = ("mass", "damping", "frictionloss")
+_FITTED = ("stiffness", "armature")  # factors too, but only where the asset states how well they are known
+
+# Model fields that a draw changes; the others only where something of a spring or an armature is drawn.
+FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping", "dof_frictionloss")
+SPRING_FIELDS = ("jnt_stiffness", "dof_armature", "qpos_spring")
 
 
 @dataclass(frozen=True)
 class Draw:
-    """One draw. axis: (3,) unit, asset frame.  point: (3,) m.  mass, damping, frictionloss: factors on the model's
-    numbers (mass: of the inertia too).  hand: (3,) m."""
+    """One draw. axis: (3,) unit, asset frame.  point: (3,) m.  mass, damping, frictionloss, stiffness, armature:
+    factors on the model's numbers (mass: of the inertia too).  hand: (3,) m.  springref: shift, rad or m."""
 
     axis: np.ndarray
     point: np.ndarray
@@ -47,11 +56,20 @@ class Draw:
     damping: float = 1.0
     frictionloss: float = 1.0
     hand: np.ndarray | None = None
+    stiffness: float = 1.0
+    armature: float = 1.0
+    springref: float = 0.0
+
+    @property
+    def springs(self) -> bool:
+        """Whether something of the :data:`SPRING_FIELDS` is drawn."""
+        return (self.stiffness, self.armature, self.springref) != (1.0, 1.0, 0.0)
 
     def as_dict(self) -> dict:
         """The draw as arrays, for ``info``; copies."""
         return {"axis": self.axis.copy(), "point": self.point.copy(), "mass": self.mass, "damping": self.damping,
-                "frictionloss": self.frictionloss, "hand": np.zeros(3) if self.hand is None else self.hand.copy()}
+                "frictionloss": self.frictionloss, "hand": np.zeros(3) if self.hand is None else self.hand.copy(),
+                "stiffness": self.stiffness, "armature": self.armature, "springref": self.springref}
 
 
 def _number(value: object) -> float | None:
@@ -64,10 +82,10 @@ def uncertainties(asset: Asset) -> dict[str, float]:
     for name, key in _ENTRIES.items():
         entry = asset.provenance.get(key) or {}
         std, value = _number(entry.get("std")), _number(entry.get("value"))
-        if name in _FACTORS:
+        if name in _FACTORS + _FITTED:
             if std is not None and value:
                 out[name] = float(np.log1p(std / value))
-            elif entry.get("origin") == "assumed":
+            elif name in _FACTORS and entry.get("origin") == "assumed":
                 out[name] = float(np.log(ASSUMED_FACTOR))
         elif std is not None:
             out[name] = std
@@ -107,7 +125,7 @@ def draw(rng: np.random.Generator, std: Mapping[str, float], axis: np.ndarray, p
 
     The generator is asked for the same numbers whatever the standard deviations are.
     """
-    normal = rng.standard_normal(11)
+    normal = rng.standard_normal(14)
     across = np.linalg.svd(axis[None])[2][1:]  # (2, 3)
     # Two directions share the angle's variance, and the shift's.
     tilt = (normal[:2] @ across) * std.get("axis", 0.0) / np.sqrt(2)
@@ -117,15 +135,24 @@ def draw(rng: np.random.Generator, std: Mapping[str, float], axis: np.ndarray, p
     factor = {name: float(np.exp(std.get(name, 0.0) * normal[4 + i])) for i, name in enumerate(_FACTORS)}
     size = float(np.exp(std.get("scale", 0.0) * normal[7]))
     return Draw(turned / np.linalg.norm(turned), point + shift, factor["mass"] * size**4, factor["damping"],
-                factor["frictionloss"], normal[8:11] * std.get("hand", 0.0) / np.sqrt(3))
+                factor["frictionloss"], normal[8:11] * std.get("hand", 0.0) / np.sqrt(3),
+                *(float(np.exp(std.get(name, 0.0) * normal[11 + i])) for i, name in enumerate(_FITTED)),
+                springref=float(std.get("springref", 0.0) * normal[13]))
 
 
 def write(fields: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], made: Draw, joints: list[int],
-          body: int, dof: int) -> None:
-    """Write a draw into model fields, relative to what they were; ``before`` holds copies of them."""
+          body: int, dof: int, qpos: int) -> None:
+    """Write a draw into model fields, relative to what they were; ``before`` holds copies of them.
+
+    The :data:`SPRING_FIELDS` are written if they are among the fields.
+    """
     fields["jnt_axis"][joints] = made.axis
     fields["jnt_pos"][joints[0]] = made.point
     for name in ("body_mass", "body_inertia"):
         fields[name][body] = before[name][body] * made.mass
     fields["dof_damping"][dof] = before["dof_damping"][dof] * made.damping
     fields["dof_frictionloss"][dof] = before["dof_frictionloss"][dof] * made.frictionloss
+    if "jnt_stiffness" in fields:
+        fields["jnt_stiffness"][joints[0]] = before["jnt_stiffness"][joints[0]] * made.stiffness
+        fields["dof_armature"][dof] = before["dof_armature"][dof] * made.armature
+        fields["qpos_spring"][qpos] = before["qpos_spring"][qpos] + made.springref

@@ -6,7 +6,7 @@ written on top of them (:mod:`taa_envs.task`) does not know which it has: a batc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -18,9 +18,6 @@ from taa_envs.scene import CONTROL_PERIOD, SUBSTEPS, Scene, touch_history
 
 if TYPE_CHECKING:
     import mujoco
-
-# Model fields that an episode may change, see taa_envs.randomize.
-MODEL_FIELDS = ("jnt_axis", "jnt_pos", "body_mass", "body_inertia", "dof_damping", "dof_frictionloss")
 
 
 class Rows(Protocol):
@@ -44,8 +41,8 @@ class Rows(Protocol):
     def time(self) -> np.ndarray:
         """(n,) s of simulation; good until the next step."""
 
-    def fields(self, row: int) -> Mapping[str, np.ndarray]:
-        """Model fields of one simulation, to write into; call :meth:`constants` afterwards."""
+    def fields(self, row: int, names: Sequence[str]) -> Mapping[str, np.ndarray]:
+        """Those model fields of one simulation, to write into; call :meth:`constants` afterwards."""
 
     def constants(self, row: int) -> None:
         """Derive what follows from changed model fields."""
@@ -98,8 +95,8 @@ class SingleRows:
         self._time[0] = self.data.time
         return self._time
 
-    def fields(self, row: int) -> dict[str, np.ndarray]:
-        return {name: getattr(self.model, name) for name in MODEL_FIELDS}
+    def fields(self, row: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        return {name: getattr(self.model, name) for name in names}
 
     def constants(self, row: int) -> None:
         self._mujoco.mj_setConst(self.model, self._mujoco.MjData(self.model))
@@ -147,10 +144,11 @@ class BatchRows:
     def time(self) -> np.ndarray:
         return self._time.copy()
 
-    def fields(self, row: int) -> dict[str, np.ndarray]:
-        if not self._model:  # only where models differ: expanded fields are copied at every step
-            self._model = {name: self.batch.expand(name) for name in MODEL_FIELDS}
-        return {name: values[row] for name, values in self._model.items()}
+    def fields(self, row: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        for name in names:
+            if name not in self._model:  # only where models differ: expanded fields are copied at every step
+                self._model[name] = self.batch.expand(name)
+        return {name: self._model[name][row] for name in names}
 
     def constants(self, row: int) -> None:
         self.batch.set_const(np.array([row]))

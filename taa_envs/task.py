@@ -25,7 +25,7 @@ from taa_envs.reward import (
     goal_reward,
     reward_scales,
 )
-from taa_envs.rows import MODEL_FIELDS, ControllerRows, Rows, hand_rows
+from taa_envs.rows import ControllerRows, Rows, hand_rows
 from taa_envs.scene import Scene, touch_columns
 
 ABSOLUTES = 63
@@ -70,9 +70,10 @@ class Task:
         self._stride = float(max(HAND_SPEED, 1.5 * rate.max())) * CONTROL_PERIOD  # m an environment step
         joint = model.joint("joint")
         joints = [joint.id] if scene.advance is None else [joint.id, model.joint("advance").id]
-        self._ids = (joints, model.body("moving").id, scene.dof)
+        self._ids = (joints, model.body("moving").id, scene.dof, scene.qpos)
         self.range = tuple(model.jnt_range[joint.id])
-        self._before = {name: getattr(model, name).copy() for name in MODEL_FIELDS}
+        self._fields = randomize.FIELDS
+        self._before = {name: getattr(model, name).copy() for name in self._fields + randomize.SPRING_FIELDS}
         self._nominal = randomize.nominal(self.asset, model.jnt_axis[joint.id], model.jnt_pos[joint.id])
         self._draws = [self._nominal] * self.n
         n, frames = self.n, len(self._times)
@@ -176,7 +177,9 @@ class Task:
     def _apply(self, row: int, made: randomize.Draw) -> None:
         if made is self._draws[row]:
             return
-        randomize.write(self.rows.fields(row), self._before, made, *self._ids)
+        if made.springs:  # from then on: what one episode drew the next one takes back
+            self._fields = randomize.FIELDS + randomize.SPRING_FIELDS
+        randomize.write(self.rows.fields(row, self._fields), self._before, made, *self._ids)
         self.rows.constants(row)
         self._draws[row] = made
         self._axis[row], self._point[row] = made.axis, made.point

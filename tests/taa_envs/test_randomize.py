@@ -10,6 +10,7 @@ import pytest
 from taa_envs import randomize
 from taa_envs.asset import Asset
 from taa_envs.env import ArticulationEnv
+from taa_envs.vector import BatchedArticulationEnv
 
 
 def with_provenance(asset: Asset, **entries: dict) -> Asset:
@@ -74,3 +75,34 @@ def test_names_choose(door: Asset) -> None:
     for bad in ({"hand": -1.0}, {"hand": float("nan")}):
         with pytest.raises(ValueError, match="finite"):
             env.reset(options={"randomize": bad})
+
+
+def test_fitted_springs_are_drawn_and_taken_back(door: Asset) -> None:
+    assert not {"stiffness", "armature", "springref"} & set(randomize.uncertainties(door))  # armature is only assumed
+    fitted = with_provenance(door, joint__stiffness={"value": 1.5, "std": 0.3, "origin": "fitted"},
+                             joint__armature={"value": 0.02, "std": 0.005, "origin": "fitted"},
+                             joint__springref={"value": 0.2, "std": 0.05, "origin": "fitted"})
+    std = randomize.uncertainties(fitted)
+    assert (std["stiffness"], std["armature"], std["springref"]) == pytest.approx((np.log(1.2), np.log(1.25), 0.05))
+    draws = [randomize.draw(np.random.default_rng(k), std, np.eye(3)[2], np.zeros(3)) for k in range(2000)]
+    assert np.log([d.stiffness for d in draws]).std() == pytest.approx(np.log(1.2), rel=0.07)
+    assert np.log([d.armature for d in draws]).std() == pytest.approx(np.log(1.25), rel=0.07)
+    assert np.std([d.springref for d in draws]) == pytest.approx(0.05, rel=0.07)
+
+    single, batch = ArticulationEnv(fitted), BatchedArticulationEnv(fitted, 2, threads=1)
+    dof, joint, qpos = single.task.scene.dof, single.model.joint("joint").id, single.task.scene.qpos
+    model = single.model
+    # The door has no spring: a factor on none is none.
+    before = model.dof_armature[dof], model.qpos_spring[qpos]
+    made = single.reset(seed=5, options={"randomize": True})[1]["randomized"]
+    assert model.dof_armature[dof] == before[0] * made["armature"] != before[0] and model.jnt_stiffness[joint] == 0
+    assert model.qpos_spring[qpos] == before[1] + made["springref"] != before[1]
+    batch.reset(seed=[5, 6], options={"randomize": True})
+    field = batch.task.rows.fields(0, randomize.SPRING_FIELDS)
+    assert field["dof_armature"][dof] == model.dof_armature[dof]
+    assert field["qpos_spring"][qpos] == model.qpos_spring[qpos]
+    for _ in range(5):
+        a, b = single.step(np.zeros(8)), batch.step(np.zeros((2, 8)))
+    np.testing.assert_allclose(a[0], b[0][0], rtol=0, atol=1e-10)
+    single.reset(options={"randomize": False})
+    assert (model.dof_armature[dof], model.qpos_spring[qpos]) == before

@@ -186,3 +186,8 @@ def test_bad_arguments(door: Asset) -> None:
         env.step(np.zeros((3, 8)))
     with pytest.raises(ValueError, match="known: q0"):
         env.reset(options={"speed": 1})
+
+
+def test_hands_with_joints_are_refused_in_one_line(door: Asset) -> None:
+    with pytest.raises(ValueError, match="one simulation at a time; use hand='points' or vectorization_mode='sync'"):
+        BatchedArticulationEnv(door, 2, hand="human")
