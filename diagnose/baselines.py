@@ -37,7 +37,7 @@ def baselines(result: Diagnosis) -> dict[str, float]:
 
 def _applied(problem: Problem, x: np.ndarray) -> mujoco.MjModel:
     """The joint with damping, drag, friction, stiffness, constant torque and armature added."""
-    model = isolated(mujoco.MjSpec.from_file(str(problem.plant.path)), problem.plant.joint)
+    model = isolated(problem.plant.spec(), problem.plant.joint)
     model.dof_damping[0] += x[0]
     model.dof_dampingpoly[0, 0] += x[1]
     model.dof_frictionloss[0] += x[2]

@@ -10,19 +10,18 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from diagnose.causes import CAUSES, Motion
-from diagnose.fit import Fit, Problem, linearise
-from diagnose.kernel import KNOTS
+from diagnose.causes import CAUSES, PLACES, Motion
+from diagnose.fit import Problem
 from diagnose.log import JointLog, LogError, check_units, drop_stale, load_log
-from diagnose.noise import Noise
-from diagnose.plant import Plant, isolated, load_plant
-from diagnose.residual import ljung_box, trim_start, where
-from diagnose.search import Found, Scored, Search, noise_floor
-from diagnose.simulate import Episode, mujoco_rollouts, prepare, shown
+from diagnose.measure import Measure, cause_of, extended, gain, remainder_of, rms
+from diagnose.plant import Plant, load_plant
+from diagnose.points import Placed, hold_second, look_at_points, weighed
+from diagnose.residual import ljung_box, shortened, trim_start
+from diagnose.search import Found, Scored, Search
+from diagnose.simulate import Episode, prepare
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import written_whole
 
-READING = ("delay", "bias", "gain", "bend2", "bend3", "bend4", "bend5", "play")
 WINDOW = 12.0  # s; longer logs of an imposed motion are cut into windows
 
 
@@ -35,7 +34,9 @@ class Diagnosis:
         data: the JSON object of the contract (without ``extended_model`` until :meth:`write`).
         plant, found: the joint and the search behind it.
         fitted, held: the two groups of episodes.
-        partly: False if the extended model is the nominal one although something was found.
+        placed: what points on the part say; None without points.
+        holds: what the extended model holds of an unexplained residual: "nothing", "causes" or "free" (torques beside
+            them).
         curves: name of episode -> {"time", "q", "nominal", "extended"} for plots.
     """
 
@@ -46,13 +47,16 @@ class Diagnosis:
     fitted: Problem
     held: Problem
     curves: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    partly: bool = True
+    placed: Placed | None = None
+    holds: str = "causes"
 
     @property
     def extends(self) -> bool:
         """True if the extended model differs from the nominal one."""
-        mechanical = [n for n in self.found.best.causes if CAUSES[n].edit is not None]
-        return self.verdict != "consistent" and self.partly and bool(mechanical)
+        mechanical = any(CAUSES[n].edit is not None for n in self.found.best.causes)
+        moved = self.placed is not None and bool(self.placed.causes)
+        changed = moved or (self.holds != "nothing" and mechanical) or self.holds == "free"
+        return self.verdict != "consistent" and changed
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -61,7 +65,17 @@ class Diagnosis:
 
     def extended_spec(self) -> mujoco.MjSpec:
         """The nominal model with what was found (of an unexplained residual, with what explains part of it)."""
-        return extended(self.plant, self.found.best if self.partly else self.found.nominal, self.fitted)
+        spec = extended(self.plant, self.chosen, self.fitted)
+        if self.placed is not None:
+            hold_second(spec, self.placed)
+        return spec
+
+    @property
+    def chosen(self) -> Scored:
+        """What the extended model holds."""
+        if self.holds == "free" and self.found.free is not None:
+            return self.found.free
+        return self.found.best if self.holds == "causes" else self.found.nominal
 
     def write(self, folder: Path | str, final: Path | None = None) -> Path:
         """Write diagnosis.json, report.html and model_extended.xml; returns the folder.
@@ -109,8 +123,9 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
     """
     path = model_path(model)
     plant = load_plant(path, joint)
-    if only is not None and set(only) - set(CAUSES):
-        raise TaaEnvsError(f"no such cause: {', '.join(sorted(set(only) - set(CAUSES)))}; known: {', '.join(CAUSES)}")
+    library = (*CAUSES, *PLACES)
+    if only is not None and set(only) - set(library):
+        raise TaaEnvsError(f"no such cause: {', '.join(sorted(set(only) - set(library)))}; known: {', '.join(library)}")
     if not logs:
         raise TaaEnvsError("no logs; give at least one CSV with --data")
     read = [log if isinstance(log, JointLog) else load_log(log) for log in logs]
@@ -129,9 +144,7 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
         if skip:
             assumptions.append(f"{Path(log.name).name}: the first {log.time[skip] - log.time[0]:.2f} s are "
                                "left out; the log says let go, but no law of motion moves the part so")  # fmt: skip
-            cut = {k: getattr(log, k)[skip:] for k in ("time", "q", "torque", "force", "point")
-                   if getattr(log, k) is not None}  # fmt: skip
-            e = prepare(plant, replace(log, **cut))
+            e = shortened(plant, e, skip)
         episodes.append(e)
         names.append(Path(log.name).name)
     driven = is_driven(plant, episodes)
@@ -146,11 +159,18 @@ def diagnose(model: Path | str, logs: list[Path | str | JointLog], joint: str = 
     held_at = [i for i in range(len(episodes)) if i % 3 == 2] if len(episodes) > 2 else [1]
     fit_at = [i for i in range(len(episodes)) if i not in held_at]
     fitted = [episodes[i] for i in fit_at]
-    motion = Motion.of(plant, fitted)
-    problem = Problem(plant, fitted, motion, driven)
-    held = problem.on([episodes[i] for i in held_at])
-    found = Search(problem, held, say, only).run()
-    return _verdict(plant, found, found.fitted, found.held, names, fit_at, held_at, assumptions)
+    held = [episodes[i] for i in held_at]
+    placed = look_at_points(plant, fitted, held, only, say)
+    if placed is not None:
+        assumptions += placed.assumptions
+        plant = placed.plant
+    problem = Problem(plant, fitted, Motion.of(plant, fitted), driven)
+    found = Search(problem, problem.on(held), say, only).run()
+    if placed is not None and placed.causes and (better := weighed(placed, found.fitted, found)) is not None:
+        plant = better
+        problem = replace(problem, plant=plant, motion=Motion.of(plant, fitted))
+        found = Search(problem, problem.on(held), say, only).run()
+    return _verdict(plant, found, placed, names, fit_at, held_at, assumptions)
 
 
 def model_path(model: Path | str) -> Path:
@@ -186,100 +206,53 @@ def _cut(plant: Plant, episodes: list[Episode], names: list[str]) -> tuple[list[
     return out, called
 
 
-def extended(plant: Plant, scored: Scored, problem: Problem) -> mujoco.MjSpec:
-    """A spec of the nominal model with the fitted causes edited in (measurement faults leave it as it is)."""
-    spec = mujoco.MjSpec.from_file(str(plant.path))
-    terms = scored.fit.terms()
-    order = sorted(scored.causes, key=lambda n: n == "inertia" and terms.get("inertia", 0) < 0)
-    for name in order:
-        edit = CAUSES[name].edit
-        if edit is not None:
-            edit(spec, plant.joint, terms, plant, problem.motion.frame)
-    return spec
-
-
-def _errors(plant: Plant, scored: Scored, held: Problem, fitted: Problem) -> list[np.ndarray]:
-    """Held-out residuals with MuJoCo itself in place of the fit's own integrator, a list of (N,)."""
-    if held.driven:
-        return scored.held.residuals
-    model = isolated(extended(plant, scored, fitted), plant.joint)
-    # The integrator's half-step convention differs from the fit's; its initial states are found anew from the fit's.
-    terms = {k: v for k, v in scored.fit.terms().items() if k in READING}
-    frame = fitted.motion.frame
-    h = model.opt.timestep
-    out = []
-    for e, local in zip(held.episodes, scored.held.local, strict=True):
-        slopes = linearise(held.on([e]), scored.fit.candidate, [local], Noise(), []).back[0]
-        x = local.copy()
-        x[1] += 0.5 * (e.step - h) * e.a[0]
-        best = None
-        for _ in range(3):
-            Q, V = mujoco_rollouts(model, e, [x])
-            read = e.log.q - shown(plant, frame, terms, Q[0], V[0], e.t, h)
-            if best is not None and read @ read > 0.999 * (best @ best):
-                best = min(best, read, key=lambda r: float(r @ r))
-                break
-            best = read
-            # The fit's integrator says how the initial state moves the readings.
-            J = (slopes[0] @ slopes[1])[: len(read), :2]
-            x[:2] += np.linalg.lstsq(J, read, rcond=None)[0]
-        out.append(best)
-    return out
-
-
-def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: list[str], fit_at: list[int],
+def _verdict(plant: Plant, found: Found, placed: Placed | None, names: list[str], fit_at: list[int],
              held_at: list[int], assumptions: list[str]) -> Diagnosis:  # fmt: skip
-    best, rivals = found.best, found.rivals
-    floor = noise_floor(held)
-    if found.left:
+    best, fitted, held = found.best, found.fitted, found.held
+    places = placed.causes if placed is not None else ()
+    displaced = placed is not None and bool(placed.found.left)
+    named = found.dominant if found.left else best.causes
+    rivals = [list(r.causes) for r in found.rivals]
+    if placed is not None:
+        rivals = [[*r, *places] for r in rivals] + [[*c, *named] for c in placed.found.rivals]
+    if displaced or (found.left and not found.dominant):
         verdict = "unexplained"
-    elif not best.causes:
-        verdict = "consistent"
     elif rivals:
         verdict = "ambiguous"
     else:
-        verdict = "explained"
-    unit = plant.torque_unit if fitted.driven else plant.unit
-    partly = True
-    nominal = _errors(plant, found.nominal, held, fitted)
-    named = best.causes if verdict in ("explained", "ambiguous") else ()
-    after = _errors(plant, best, held, fitted) if named else nominal
-    if verdict == "unexplained":
-        part = _errors(plant, best, held, fitted) if best.causes else nominal
-        after = min(nominal, part, key=_rms)
-        partly = after is part and bool(best.causes)
-        if partly:
-            assumptions.append(f"the extended model holds {', '.join(best.causes)}, which explains part of the error; "
-                               "what is left biases their values beyond their intervals")  # fmt: skip
-        if found.free is not None:
-            left = _rms(found.free.held.residuals)
-            assumptions.append(f"free torques over position and velocity ({KNOTS} knots each) beside "
-                               f"{', '.join(best.causes) or 'no cause'} leave {left:.4g} {unit} of the held-out "
-                               "episodes; plain MJCF has no such torque, so the model does not hold them")  # fmt: skip
-    ratio, interval = _gain(nominal, after)
-    causes = [_cause(n, best.fit, found, plant, fitted.motion.frame.middle) for n in named]
-    experiment = None
+        verdict = "explained" if named or places else "consistent"
+    result = Diagnosis(verdict, {}, plant, found, fitted, held, placed=placed)
+    measure = Measure(result)
+    unit = measure.unit
+    after = measure.extended
+    if found.left and result.holds != "nothing" and best.causes:
+        assumptions.append(f"the extended model holds {', '.join(best.causes)}; what is left biases their values "
+                           "beyond their intervals")  # fmt: skip
+    if result.holds == "free":
+        assumptions.append("beside them it holds free torques: over position as passive ripple, over velocity as "
+                           "damping and friction")  # fmt: skip
+    ratio, interval = gain(measure.nominal, after)
+    causes = [*(cause_of(n, found, fitted) for n in named), *(placed.reported() if placed is not None else [])]
+    alternatives, experiment = [], None
     if verdict == "unexplained":
         causes = [{"name": "unknown", "parameters": {}, "evidence": {
-            "where": where(plant, held.episodes, best.held.residuals, unit), "why": found.left,
-            "partly": list(best.causes), "rmse": best.held.rmse, "parameters": {
-                n: _cause(n, best.fit, found, plant, fitted.motion.frame.middle)["parameters"] for n in best.causes},
-            "free_torques": _free_torques(found, fitted)}}]  # fmt: skip
+            **remainder_of(found, fitted, held, measure), "partly": [*best.causes, *places],
+            "parameters": {n: cause_of(n, found, fitted)["parameters"] for n in best.causes}}}]  # fmt: skip
+        if displaced and placed is not None:
+            causes[0]["evidence"]["why"] = "; ".join(w for w in (placed.found.left, found.left) if w)
         experiment = "repeat the same motion twice, then at another speed and from the other side"
-    alternatives = []
     if verdict == "ambiguous":
-        alternatives = [list(r.causes) for r in rivals]
-        mine = set(best.causes)
-        other = set(rivals[0].causes)
+        alternatives = rivals
         experiment = "; or ".join(dict.fromkeys(
-            CAUSES[n].experiment for n in sorted(mine ^ other) if CAUSES[n].experiment))  # fmt: skip
+            text for n in sorted({*named, *places} ^ set(rivals[0]))
+            if (text := (CAUSES[n] if n in CAUSES else PLACES[n]).experiment)))  # fmt: skip
     if any(CAUSES[n].measurement for n in named):
-        assumptions.append("faults of the measurement are named, not put into the extended model")
+        assumptions.append("faults of the measurement do not change the moving part of the extended model")
     whiteness = ljung_box(best.fit.residuals)
-    data = {
+    result.data |= {
         "verdict": verdict, "causes": causes, "alternatives": alternatives, "next_experiment": experiment,
-        "nominal": {"heldout_rmse": _rms(nominal)}, "extended": {"heldout_rmse": _rms(after)}, "noise_floor": floor,
-        "gain": {"heldout_rmse_ratio": ratio, "ci95": interval},
+        "nominal": {"heldout_rmse": rms(measure.nominal)}, "extended": {"heldout_rmse": rms(after)},
+        "noise_floor": measure.floor, "gain": {"heldout_rmse_ratio": ratio, "ci95": interval},
         "episodes": {"fit": [names[i] for i in fit_at], "heldout": [names[i] for i in held_at]},
         "extended_model": None, "assumptions": assumptions, "unit": unit,
         "whiteness": {"ljung_box": whiteness[0], "p": whiteness[1]},
@@ -287,63 +260,9 @@ def _verdict(plant: Plant, found: Found, fitted: Problem, held: Problem, names: 
                     for f in found.ranking[:12]],
         "noise": {"std": found.noise.std, "phi": found.noise.phi, "theta": found.noise.theta},
     }  # fmt: skip
-    result = Diagnosis(verdict, data, plant, found, fitted, held, partly=partly)
-    for i, e, n, x in zip(held_at, held.episodes, nominal, after, strict=True):
+    if found.left and found.dominant:
+        result.data["remainder"] = remainder_of(found, fitted, held, measure)
+    for i, e, n, x in zip(held_at, held.episodes, measure.in_q[0], measure.in_q[1], strict=True):
         y = e.u if held.driven else e.log.q
         result.curves[names[i]] = {"time": e.t, "q": e.q, "v": e.v, "measured": y, "nominal": y - n, "extended": y - x}
     return result
-
-
-def _cause(name: str, fit: Fit, found: Found, plant: Plant, middle: float) -> dict:
-    """One cause as the contract has it; a spring's torque is counted from ``middle``."""
-    terms, std = fit.terms(), fit.std()
-    inertia = "kg m^2" if plant.hinge else "kg"
-    parameters = {}
-    for p in CAUSES[name].parameters:
-        unit = p.unit.format(q=plant.unit, t=plant.torque_unit, i=inertia)
-        v, s = terms[p.term], std[p.term]
-        s = s if np.isfinite(s) else abs(v)
-        parameters[p.name] = {"value": v, "unit": unit, "ci95": [v - 1.96 * s, v + 1.96 * s]}
-    if name == "spring":
-        k, at = terms["stiffness"], terms["spring_torque"]
-        rest = middle + at / k
-        index = [p.term for p in fit.candidate.parameters()].index("stiffness")
-        g = np.array([-at / k**2, 1 / k])
-        s = float(np.sqrt(max(g @ fit.cov[index : index + 2, index : index + 2] @ g, 0)))
-        parameters.pop("torque_at_middle")
-        parameters["rest"] = {"value": rest, "unit": plant.unit, "ci95": [rest - 1.96 * s, rest + 1.96 * s]}
-    without = found.without[name]
-    evidence = {"sentence": CAUSES[name].sentence, "z": fit.z(name), "nats_fit": without.fit.nats - fit.nats,
-                "nats_heldout": 0.5 * (without.held.chi2 - found.best.held.chi2),
-                "heldout_rmse_without": without.held.rmse}  # fmt: skip
-    return {"name": name, "parameters": parameters, "evidence": evidence}
-
-
-def _free_torques(found: Found, fitted: Problem) -> dict | None:
-    """The free torques beside the best set: knots over position and over velocity, and the torque at each."""
-    if found.free is None or found.free.fit.candidate.spline is None:
-        return None
-    frame, values = fitted.motion.frame, found.free.fit.candidate.spline
-    return {"position": np.linspace(*frame.q, KNOTS).tolist(), "torque_over_position": values[:KNOTS].tolist(),
-            "velocity": np.linspace(*frame.v, KNOTS).tolist(), "torque_over_velocity": values[KNOTS:].tolist(),
-            "unit": fitted.plant.torque_unit, "heldout_rmse": found.free.held.rmse}  # fmt: skip
-
-
-def _rms(residuals: list[np.ndarray]) -> float:
-    e = np.concatenate(residuals)
-    return float(np.sqrt(np.mean(e * e)))
-
-
-def _gain(before: list[np.ndarray], after: list[np.ndarray], draws: int = 1000) -> tuple[float, list[float]]:
-    """Ratio of held-out errors with a 95 % interval from blocks of a quarter of an episode drawn again."""
-    pairs = []
-    for b, a in zip(before, after, strict=True):
-        for part in np.array_split(np.arange(len(b)), 4):
-            pairs.append((float(b[part] @ b[part]), float(a[part] @ a[part])))
-    table = np.array(pairs)
-    rng = np.random.default_rng(0)
-    pick = rng.integers(0, len(table), (draws, len(table)))
-    s = table[pick].sum(axis=1)
-    r = np.sqrt(s[:, 1] / np.maximum(s[:, 0], 1e-300))
-    total = table.sum(axis=0)
-    return float(np.sqrt(total[1] / max(total[0], 1e-300))), [float(x) for x in np.percentile(r, [2.5, 97.5])]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +30,7 @@ class JointLog:
         q: (N,) measured joint position, rad or m.
         torque: (N,) generalized force of whatever drives the joint, N m or N; None if not logged.
         force, point: (N, 3) a hand's force on the moving link and where it acts, world frame; None if not logged.
+        markers: (N, K, 3) m, points fixed to the moving part, world frame, NaN where not seen; None if not logged.
     """
 
     name: str
@@ -40,7 +42,7 @@ class JointLog:
     markers: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for key in ("time", "q", "torque", "force", "point"):
+        for key in ("time", "q", "torque", "force", "point", "markers"):
             value = getattr(self, key)
             if value is not None:
                 object.__setattr__(self, key, np.array(value, dtype=float))
@@ -62,6 +64,13 @@ class JointLog:
         if not (step > 0).all():
             row = int(np.argmin(step > 0)) + 1
             raise LogError(f"{self.name}, sample {row}: time does not increase; sort the rows and drop doubles")
+        if self.markers is not None:
+            if self.markers.ndim != 3 or self.markers.shape[::2] != (n, 3):
+                raise LogError(f"{self.name}: markers has shape {self.markers.shape}, expected ({n}, K, 3)")
+            seen = np.isfinite(self.markers).all(axis=2).mean(axis=0)
+            if np.isinf(self.markers).any() or (seen < 0.5).any():
+                raise LogError(f"{self.name}: marker {int(np.argmin(seen)) + 1} is seen in {seen.min():.0%} of the "
+                               "rows; leave out the columns of points that are seen in less than half")  # fmt: skip
         if (self.force is None) != (self.point is None):
             raise LogError(f"{self.name} has a force without its point (or the other way); log all of "
                            f"{', '.join(FORCE_COLUMNS)}")  # fmt: skip
@@ -95,11 +104,12 @@ def load_log(path: Path | str) -> JointLog:
             partial = [c for c in FORCE_COLUMNS if c in names]
             if partial and len(partial) < len(FORCE_COLUMNS):
                 raise LogError(f"{path} has {', '.join(partial)} only; a hand's force needs {', '.join(FORCE_COLUMNS)}")
-            wanted = ["time", "q", *(["torque"] if "torque" in names else []), *partial]
+            marks = marker_columns(path, names)
+            wanted = ["time", "q", *(["torque"] if "torque" in names else []), *partial, *marks]
             table = []
             for row in rows:
-                try:
-                    table.append([float(row[c]) for c in wanted])
+                try:  # a point that was not seen is an empty cell
+                    table.append([float("nan") if c in marks and row[c] == "" else float(row[c]) for c in wanted])
                 except (TypeError, ValueError):
                     raise LogError(f"{path}, line {rows.line_num}: {', '.join(wanted)} must be numbers; mend that row"
                                    ) from None  # fmt: skip
@@ -111,7 +121,22 @@ def load_log(path: Path | str) -> JointLog:
     if partial:
         force = np.stack([column[c] for c in FORCE_COLUMNS[:3]], axis=1)
         point = np.stack([column[c] for c in FORCE_COLUMNS[3:]], axis=1)
-    return JointLog(str(path), column["time"], column["q"], column.get("torque"), force, point)
+    markers = np.stack([column[c] for c in marks], axis=1).reshape(len(values), -1, 3) if marks else None
+    return JointLog(str(path), column["time"], column["q"], column.get("torque"), force, point, markers)
+
+
+def marker_columns(path: Path, names: Sequence[str]) -> list[str]:
+    """The columns ``marker<NAME>_x``, ``_y``, ``_z`` of points fixed to the moving part, point by point.
+
+    Raises:
+        LogError: a point has not all three.
+    """
+    points = dict.fromkeys(n[:-2] for n in names if n.startswith("marker") and n[-2:] in ("_x", "_y", "_z"))
+    columns = [f"{p}_{c}" for p in points for c in "xyz"]
+    missing = [c for c in columns if c not in names]
+    if missing:
+        raise LogError(f"{path} has no column {missing[0]}; a point on the part needs _x, _y and _z (world frame, m)")
+    return columns
 
 
 def check_units(log: JointLog, hinge: bool, model_range: tuple[float, float] | None) -> None:

@@ -9,6 +9,7 @@ with the static torque ``s`` (gravity, springs, passive actuators) read from MuJ
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,8 @@ class Plant:
         damping: (3,) coefficients of v, v|v|, v^3.  frictionloss: N m or N.
         stiffness, springref: of the joint's linear spring.
         limits: (lower, upper) or None.  timestep: s.
+        reference: position in which the file draws the part.
+        edit: what is changed in the file's model before all else (the joint's place); None for nothing.
     """
 
     path: Path
@@ -48,6 +51,15 @@ class Plant:
     springref: float
     limits: tuple[float, float] | None
     timestep: float
+    reference: float = 0.0
+    edit: Callable[[mujoco.MjSpec], None] | None = None
+
+    def spec(self) -> mujoco.MjSpec:
+        """A fresh spec of the model."""
+        spec = mujoco.MjSpec.from_file(str(self.path))
+        if self.edit is not None:
+            self.edit(spec)
+        return spec
 
     def row(self) -> tuple[np.ndarray, np.ndarray]:
         """The joint as numbers for :mod:`diagnose.kernel`: (16,) and the table of static torques (M,)."""
@@ -97,8 +109,8 @@ def isolated(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
     return model
 
 
-def load_plant(path: Path | str, joint: str) -> Plant:
-    """Read the joint from an MJCF file.
+def load_plant(path: Path | str, joint: str, edit: Callable[[mujoco.MjSpec], None] | None = None) -> Plant:
+    """Read the joint from an MJCF file, after an edit of its spec if one is given.
 
     Raises:
         TaaEnvsError: the file does not load, has no such joint, or the joint is no hinge and no slide.
@@ -108,6 +120,8 @@ def load_plant(path: Path | str, joint: str) -> Plant:
         raise TaaEnvsError(f"no such model: {path}; give an asset id or an MJCF file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        if edit is not None:
+            edit(spec)
         model = spec.compile()
     except ValueError as error:
         raise TaaEnvsError(f"{path} does not load in MuJoCo ({error}); mend the file") from None
@@ -146,4 +160,5 @@ def load_plant(path: Path | str, joint: str) -> Plant:
     poly = model.dof_dampingpoly[0]
     return Plant(path, joint, hinge, axis, anchor, float(full[0, 0]), tuple(float(v) for v in gravity),
                  None if exact else (grid, static), (float(model.dof_damping[0]), float(poly[0]), float(poly[1])),
-                 float(model.dof_frictionloss[0]), stiffness, springref, limits, float(model.opt.timestep))
+                 float(model.dof_frictionloss[0]), stiffness, springref, limits, float(model.opt.timestep),
+                 float(model.qpos0[0]), edit)

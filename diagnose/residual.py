@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from diagnose.plant import Plant
-from diagnose.simulate import Episode
+from diagnose.simulate import Episode, prepare
+
+MOST_START = 0.15  # of an episode, that may be left out at its start
 
 
 def ljung_box(residuals: list[np.ndarray], lags: int = 10) -> tuple[float, float]:
@@ -47,10 +51,8 @@ def trim_start(plant: Plant, episode: Episode) -> int:
     """
     e = episode
     n = len(e.t)
-    most = int(0.15 * n)
-    if e.log.torque is None and e.log.force is None:
-        return 0
-    if e.u[: most + 1].any() or abs(e.v[:5].mean()) < 0.1 * np.abs(e.v).max():
+    most = let_go(e)
+    if most == 0:
         return 0
     shape = [np.sin(e.q), np.cos(e.q)] if plant.hinge else [e.q]
     F = np.stack([*shape, np.ones(n), e.v, e.v * np.abs(e.v), np.sign(e.v)], axis=1)
@@ -66,3 +68,22 @@ def trim_start(plant: Plant, episode: Episode) -> int:
     if not off[0]:
         return 0
     return min(int(np.argmin(off)) + long // 2, most) if not off.all() else most
+
+
+def let_go(episode: Episode, share: float = MOST_START) -> int:
+    """How many rows at the start of an episode might not be free although the log says let go; 0 if it does not say so
+    or the part does not move there."""
+    e = episode
+    most = int(share * len(e.t))
+    if e.log.torque is None and e.log.force is None:
+        return 0
+    if e.u[: most + 1].any() or abs(e.v[:5].mean()) < 0.1 * np.abs(e.v).max():
+        return 0
+    return most
+
+
+def shortened(plant: Plant, episode: Episode, cut: int) -> Episode:
+    """The episode without its first rows."""
+    log = episode.log
+    keys = [k for k in ("time", "q", "torque", "force", "point", "markers") if getattr(log, k) is not None]
+    return prepare(plant, replace(log, **{k: getattr(log, k)[cut:] for k in keys}), episode.step)

@@ -13,9 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from diagnose.causes import CAUSES, UNNAMED
+from diagnose.dominant import CUT, SAME, WITHOUT, Steady, steadiness
+from diagnose.dominant import RIVAL as RIVAL_ERROR
 from diagnose.fit import Candidate, Fit, Problem, bounds, fit, scales
 from diagnose.noise import Excess, Noise, estimate, excess
-from diagnose.screen import Guess, Regression, shortlist, tangents
+from diagnose.screen import Guess, Regression, joins, shortlist, tangents
 from diagnose.simulate import FINE, SHORT
 
 MOST = 4  # causes in a set
@@ -63,6 +65,8 @@ class Found:
         free: the best set with free torques over q and over velocity beside it; None if nothing asked for it.
         left: why something is left that the library does not explain; empty if nothing is.
         excess: slow residual beyond the noise.
+        dominant: causes of the best set that are sure although something is left; see :mod:`diagnose.dominant`.
+        steady: of each of the best set's mechanical causes, how steady; empty unless something is left.
     """
 
     best: Scored
@@ -76,6 +80,8 @@ class Found:
     free: Scored | None = None
     left: str = ""
     excess: Excess | None = None
+    dominant: tuple[str, ...] = ()
+    steady: dict[str, Steady] = field(default_factory=dict)
 
 
 class Search:
@@ -124,6 +130,8 @@ class Search:
         found.without = {n: self._judge(_less(best.causes, n)) for n in best.causes}
         found.rivals = self._rivals(scored)
         self._left(found)
+        if found.left:
+            self._dominant(found)
         found.ranking = sorted(self.done.values(), key=lambda f: f.nats)
         return found
 
@@ -136,7 +144,7 @@ class Search:
             key = _sorted(g.causes)
             if key in known:
                 continue
-            f = fit(self.fitted, _candidate(self.fitted, key, g.values), self.noise)
+            f = fit(self.fitted, candidate_of(self.fitted, key, g.values), self.noise)
             if key not in self.done or f.chi2 < self.done[key].chi2:
                 self.done[key] = f
 
@@ -200,7 +208,7 @@ class Search:
         """A set with its held-out episodes under the present noise."""
         if causes not in self.done:
             best = self._best()
-            self.done[causes] = fit(self.fitted, _candidate(self.fitted, causes, best.terms()), self.noise,
+            self.done[causes] = fit(self.fitted, candidate_of(self.fitted, causes, best.terms()), self.noise,
                                     local=best.local)  # fmt: skip
         f = self.done[causes]
         if causes not in self.judged:
@@ -284,6 +292,37 @@ class Search:
             found.left = found.left or (f"slow errors of {found.excess.share:.1f} times the noise are left, and no "
                                         "torque that depends on position and velocity explains them")  # fmt: skip
 
+    def _dominant(self, found: Found) -> None:
+        """Of a set that leaves something: the causes that are sure, and what would do in their place."""
+        best = found.best
+        mechanical = tuple(n for n in best.causes if CAUSES[n].edit is not None)
+        if best.held.rmse > CUT * found.nominal.held.rmse or not mechanical:
+            return
+        found.steady = steadiness(mechanical, best.fit.terms(), self.fitted, self.held)
+        found.dominant = tuple(n for n in mechanical if found.steady[n].deviation <= SAME
+                               and found.without[n].held.rmse >= WITHOUT * best.held.rmse)  # fmt: skip
+        found.rivals = []
+        for name in found.dominant:
+            rest = _less(best.causes, name)
+            for other in self.names:
+                if other in UNNAMED or other in best.causes or not joins(list(rest), other):
+                    continue
+                scored = self._judge(_sorted((*rest, other)))
+                if scored.held.rmse <= RIVAL_ERROR * best.held.rmse or (
+                        name == "gravity_torque" and other == "inertia" and self._same_as_inertia(best)):  # fmt: skip
+                    found.rivals.append(scored)
+
+    def _same_as_inertia(self, best: Scored) -> bool:
+        """True if an added weight is but a multiple of the model's own and no input is logged: then it is one thing
+        with less inertia, whatever else is left."""
+        terms, (sine, cosine, _) = best.fit.terms(), self.fitted.plant.gravity
+        own, added = np.array([sine, cosine]), np.array([terms["gravity_sin"], terms["gravity_cos"]])
+        if any(e.u.any() for e in self.fitted.episodes) or not own.any():
+            return False
+        own /= np.linalg.norm(own)
+        return bool(np.linalg.norm(added - (added @ own) * own) < 0.1 * np.linalg.norm(added))
+
+
 def lists_rss(lists: dict[int, list[Guess]], causes: tuple[str, ...], default: float) -> float:
     """What the regression says that a set leaves."""
     same = [g.rss for g in lists.get(len(causes), []) if set(g.causes) == set(causes)]
@@ -316,7 +355,7 @@ def _again(ep, driven: bool) -> np.ndarray:
     return smooth(ep.t, ep.u)[0]
 
 
-def _candidate(problem: Problem, causes: tuple[str, ...], values: dict[str, float]) -> Candidate:
+def candidate_of(problem: Problem, causes: tuple[str, ...], values: dict[str, float]) -> Candidate:
     """A start; a parameter that must not be negative starts off its bound, else its slope is all the fit sees of it."""
     empty = Candidate(causes, np.zeros(0))
     parameters = empty.parameters()
@@ -340,4 +379,4 @@ def _sorted(causes: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(causes, key=order.index))
 
 
-__all__ = ["Found", "Scored", "Search", "noise_floor", "rounding"]
+__all__ = ["Found", "Scored", "Search", "candidate_of", "noise_floor", "rounding"]

@@ -75,6 +75,8 @@ def draw(seed: int, plant: str, names: tuple[str, ...], noise: str = "white", pr
     length = 1.0 if hinge else 0.4
     u = rng.uniform(0.6, 1.4, 30)
     sign = rng.choice([-1.0, 1.0])
+    if protocol == "one_way":
+        sign = -1.0  # a torque along the only direction of motion is no friction: nothing would be confusable
     s = strength
     draws = {
         "viscous_damping": {"damping": s * 0.5 * u[0] * tau / speed},

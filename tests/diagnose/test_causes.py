@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnose.causes import CAUSES, UNNAMED
+from diagnose.causes import CAUSES, PLACES, UNNAMED
 from diagnose.kernel import TERMS as KERNEL_TERMS
 from diagnose.log import JointLog
 from diagnose.plant import isolated, load_plant
@@ -58,8 +58,8 @@ def test_edit_agrees_with_the_fit(tmp_path, name, terms, tolerance, angle, ref):
 def test_names_are_those_of_the_contract():
     contract = {"viscous_damping", "quadratic_drag", "coulomb_friction", "stribeck_friction", "spring",
                 "constant_torque", "gravity_torque", "inertia", "backlash", "end_stop", "detent", "time_delay",
-                "sensor_bias", "sensor_gain"}  # fmt: skip
-    assert set(CAUSES) - set(UNNAMED) == contract
+                "sensor_bias", "sensor_gain", "axis_misalignment", "pivot_offset", "second_joint"}  # fmt: skip
+    assert {*CAUSES, *PLACES} - set(UNNAMED) == contract
     terms = [p.term for c in CAUSES.values() for p in c.parameters]
     assert set(terms) <= set(KERNEL_TERMS)
 
