@@ -26,11 +26,18 @@ from pathlib import Path
 
 import numpy as np
 
-_SPEC = importlib.util.spec_from_file_location(
-    "injector", Path(__file__).resolve().parents[1] / "tests" / "diagnose" / "injector.py")  # fmt: skip
-injector = importlib.util.module_from_spec(_SPEC)
-sys.modules["injector"] = injector
-_SPEC.loader.exec_module(injector)
+
+def _injector(name: str):
+    """A module of the tests, which are no package that is installed."""
+    path = Path(__file__).resolve().parents[1] / "tests" / "diagnose" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+injector, points = _injector("injector"), _injector("injector_points")
 
 SEED = 20_000  # of the table; development used others
 STRENGTHS = (0.02, 0.06, 0.2)
@@ -49,6 +56,8 @@ def cells() -> Iterator[tuple[str, tuple[str, ...], dict]]:
         yield f"outside:{name}", (name,), {}
     for label, (name, protocol, *_) in injector.CONFUSABLE.items():
         yield f"confusable:{label}", (name,), {"protocol": protocol}
+    for effect in points.EFFECTS:
+        yield f"points:{effect}", (effect,), {}
     for name in CURVES:
         for strength in STRENGTHS:
             yield f"power:{name}:{strength}", (name,), {"strength": strength}
@@ -58,10 +67,41 @@ def plants_of(label: str, names: tuple[str, ...]) -> list[str]:
     """Mechanisms of a cell."""
     if label.startswith("confusable:"):
         return list(injector.CONFUSABLE[label.split(":", 1)[1]][2])
+    if label.startswith("points:"):
+        return ["hinge"] if names == ("pivot_offset",) else ["hinge", "slide"]
     return injector.fits(names)
 
 
-def run(label: str, names: tuple[str, ...], how: dict, plant: str, seed: int, logs: int, beside: bool) -> dict:
+def run_points(label: str, effect: str, kind: str, seed: int) -> dict:
+    """The same for a joint's place and logs with 3D points; the points' noise has a memory in every other case."""
+    from diagnose import diagnose
+
+    with tempfile.TemporaryDirectory(prefix="taa-diagnosis-") as folder:
+        case, model, files = points.write_points(seed, effect, Path(folder), kind, memory=0.8 * (seed % 2))
+        busy = time.process_time()
+        result = diagnose(model, files, "j")
+        busy = time.process_time() - busy
+    d, names = result.data, () if effect == "nothing" else (effect,)
+    said = {c for c in result.causes if c != "unknown"}
+    loose = effect == "loose_point"
+    want = "unexplained" if loose else "explained" if names else "consistent"
+    right = result.verdict == want and (loose or said == set(names))
+    errors, covered = [], []
+    if right and case.truth:
+        ((key, truth),) = case.truth.items()
+        p = d["causes"][0]["parameters"][key]
+        errors, covered = [abs(p["value"] / truth - 1)], [bool(p["ci95"][0] <= truth <= p["ci95"][1])]
+    elif right and case.direction is not None:
+        axis = np.array([d["causes"][0]["parameters"][f"axis_{c}"]["value"] for c in "xyz"])
+        errors = [float(np.arccos(min(abs(axis @ case.direction) / np.linalg.norm(axis), 1.0)))]
+    return {"cell": label, "plant": kind, "seed": seed, "cpu": busy, "verdict": result.verdict, "said": sorted(said),
+            "right": bool(right), "wrong": bool((result.verdict == "explained" and said != set(names)) or (not names and said)),
+            "errors": errors, "covered": covered, "nominal": d["nominal"]["heldout_rmse"] / 1e-3,
+            "extended": d["extended"]["heldout_rmse"] / 1e-3}  # fmt: skip
+
+
+def run(label: str, names: tuple[str, ...], how: dict, plant: str, seed: int, logs: int, beside: bool,
+        oracle: bool) -> dict:  # fmt: skip
     """Hide, diagnose, compare: one row."""
     from diagnose import diagnose
     from diagnose.baselines import baselines
@@ -74,8 +114,9 @@ def run(label: str, names: tuple[str, ...], how: dict, plant: str, seed: int, lo
         result = diagnose(model, files, "j")
         row |= {"seconds": time.monotonic() - begin, "cpu": time.process_time() - busy}
         d = result.data
-        if beside:
+        if oracle:
             row["oracle"] = diagnose(model, files, "j", only=names).data["extended"]["heldout_rmse"] / case.sigma
+        if beside:
             row["baselines"] = {k: v / case.sigma for k, v in baselines(result).items()}
     said = {c for c in result.causes if c != "unknown"}
     outside = label.startswith("outside:")
@@ -89,7 +130,7 @@ def run(label: str, names: tuple[str, ...], how: dict, plant: str, seed: int, lo
         want = "unexplained" if outside else "explained" if names else "consistent"
         right = result.verdict == want and (outside or said == set(names))
         right |= how.get("noise") == "distorted" and result.verdict == "unexplained"  # the reading is bent, and said so
-        wrong = result.verdict == "explained" and (outside or said != set(names))
+        wrong = result.verdict == "explained" and (outside or said != set(names)) or bool(not names and said)
     errors, covered = [], []
     if result.verdict == "explained" and said == set(names):
         for cause in d["causes"]:
@@ -107,6 +148,14 @@ def upper(bad: int, of: int) -> float:
     from scipy.stats import beta
 
     return 1.0 if bad >= of else float(beta.ppf(0.95, bad + 1, of - bad))
+
+
+def share(good: int, of: int) -> str:
+    """A rate with its 95 % interval (Wilson)."""
+    z, p = 1.96, good / of
+    middle, half = p + z * z / (2 * of), z * np.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
+    low, high = ((middle + s * half) / (1 + z * z / of) for s in (-1, 1))
+    return f"{p:.0%} ({low:.0%} to {high:.0%})"
 
 
 def lines_of(head: list[str], rows: list[list]) -> str:
@@ -127,16 +176,17 @@ def tables(rows: list[dict]) -> str:
             continue
         errors, covered = [e for r in cell for e in r["errors"]], [c for r in cell for c in r["covered"]]
         n, bad = len(cell), sum(r["wrong"] for r in cell)
-        body.append([label, n, f"{sum(r['right'] for r in cell) / n:.0%}", f"{bad} (<= {upper(bad, n):.0%})",
+        body.append([label, n, share(sum(r["right"] for r in cell), n), f"{bad} (<= {upper(bad, n):.0%})",
                      f"{np.median(errors):.2%}, {np.percentile(errors, 95):.2%}" if errors else "",
                      f"{sum(covered)} of {len(covered)}" if covered else "",
                      f"{np.median([r['nominal'] for r in cell]):.1f}",
                      f"{np.median([r['extended'] for r in cell]):.2f}"])  # fmt: skip
-    out.append(lines_of(["hidden", "cases", "right", "wrong name (95 % bound)", "parameter error, median, 95th centile",
+    out.append(lines_of(["hidden", "cases", "right (95 % interval)", "wrong name (95 % bound)", "parameter error, median, 95th centile",
                          "intervals that hold", "nominal / noise", "extended / noise"], body))  # fmt: skip
     groups = {"single effects": lambda s: ":" not in s and "+" not in s, "pairs": lambda s: "+" in s,
               "nothing": lambda s: s.startswith("nothing:"), "outside": lambda s: s.startswith("outside:"),
-              "confusable": lambda s: s.startswith("confusable:")}  # fmt: skip
+              "confusable": lambda s: s.startswith("confusable:"),
+              "points": lambda s: s.startswith("points:")}  # fmt: skip
     body = []
     for name, mine in groups.items():
         cell = [r for s, c in by.items() if mine(s) for r in c]
@@ -144,11 +194,11 @@ def tables(rows: list[dict]) -> str:
             continue
         n, bad = len(cell), sum(r["wrong"] for r in cell)
         errors, covered = [e for r in cell for e in r["errors"]], [c for r in cell for c in r["covered"]]
-        body.append([name, n, f"{sum(r['right'] for r in cell) / n:.1%}", f"{bad / n:.1%} (<= {upper(bad, n):.1%})",
+        body.append([name, n, share(sum(r["right"] for r in cell), n), f"{bad / n:.1%} (<= {upper(bad, n):.1%})",
                      f"{np.median(errors):.2%}" if errors else "",
                      f"{np.mean(np.array(errors) <= 0.1):.1%}" if errors else "",
                      f"{np.mean(covered):.1%} of {len(covered)}" if covered else ""])  # fmt: skip
-    out.append(lines_of(["group", "cases", "right", "wrong name (95 % bound)", "median error", "within 10 %",
+    out.append(lines_of(["group", "cases", "right (95 % interval)", "wrong name (95 % bound)", "median error", "within 10 %",
                          "intervals that hold"], body))  # fmt: skip
     body = []
     for label, cell in by.items():
@@ -170,11 +220,11 @@ def tables(rows: list[dict]) -> str:
     beside = [r for r in rows if "oracle" in r and r["verdict"] == "explained" and not r["wrong"]]
     if beside:
         ratio = np.array([r["extended"] / r["oracle"] for r in beside])
-        keys = sorted({k for r in beside for k in r["baselines"]})
+        keys = sorted({k for r in beside for k in r.get("baselines", {})})
         body = [["extended model over the oracle's", len(beside), f"{np.median(ratio):.3f}",
                  f"{np.percentile(ratio, 95):.3f}", f"{np.mean(ratio <= 1.15):.0%}"]]  # fmt: skip
         for k in keys:
-            r = np.array([x["baselines"][k] / x["oracle"] for x in beside])
+            r = np.array([x["baselines"][k] / x["oracle"] for x in beside if "baselines" in x])
             body.append([f"{k} over the oracle's", len(r), f"{np.median(r):.3f}", f"{np.percentile(r, 95):.3f}",
                          f"{np.mean(r <= 1.15):.0%}"])  # fmt: skip
         out.append("Held-out error of explained cases (the oracle is told the true causes).\n\n" + lines_of(
@@ -190,7 +240,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", help="labels of cells (or their beginnings)")
     parser.add_argument("--cases", type=int, default=1, help="cases a cell")
-    parser.add_argument("--beside", type=int, default=1, help="cases a cell with the oracle and the baselines")
+    parser.add_argument("--beside", type=int, default=1, help="cases a cell with the baselines")
+    parser.add_argument("--oracle", type=int, default=5, help="cases a cell with the oracle")
     parser.add_argument("--logs", type=int, default=6, help="logs a case")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--rows", type=Path, help="file of rows, one JSON object a line; read first, then added to")
@@ -209,8 +260,12 @@ def main() -> None:
             if (args.only and not any(label.startswith(o) for o in args.only)) or (label, seed) in there:
                 continue
             plants = plants_of(label, names)
-            beside = k < args.beside and not label.startswith(("confusable:", "power:", "nothing:", "outside:"))
-            row = run(label, names, how, plants[(number + k) % len(plants)], seed, args.logs, beside)
+            plant, named = plants[(number + k) % len(plants)], ":" not in label
+            if label.startswith("points:"):
+                row = run_points(label, names[0], plant, seed)
+            else:
+                row = run(label, names, how, plant, seed, args.logs, k < args.beside and named,
+                          k < args.oracle and named)  # fmt: skip
             rows.append(row)
             if args.rows:
                 with args.rows.open("a") as f:
