@@ -95,7 +95,7 @@ def run_points(label: str, effect: str, kind: str, seed: int) -> dict:
         axis = np.array([d["causes"][0]["parameters"][f"axis_{c}"]["value"] for c in "xyz"])
         errors = [float(np.arccos(min(abs(axis @ case.direction) / np.linalg.norm(axis), 1.0)))]
     return {"cell": label, "plant": kind, "seed": seed, "cpu": busy, "verdict": result.verdict, "said": sorted(said),
-            "right": bool(right), "wrong": bool((result.verdict == "explained" and said != set(names)) or (not names and said)),
+            "right": bool(right), "wrong": bool(said != set(names) and (not names or result.verdict == "explained")),
             "errors": errors, "covered": covered, "nominal": d["nominal"]["heldout_rmse"] / 1e-3,
             "extended": d["extended"]["heldout_rmse"] / 1e-3}  # fmt: skip
 
@@ -181,7 +181,8 @@ def tables(rows: list[dict]) -> str:
                      f"{sum(covered)} of {len(covered)}" if covered else "",
                      f"{np.median([r['nominal'] for r in cell]):.1f}",
                      f"{np.median([r['extended'] for r in cell]):.2f}"])  # fmt: skip
-    out.append(lines_of(["hidden", "cases", "right (95 % interval)", "wrong name (95 % bound)", "parameter error, median, 95th centile",
+    out.append(lines_of(["hidden", "cases", "right (95 % interval)", "wrong name (95 % bound)",
+                         "parameter error, median, 95th centile",
                          "intervals that hold", "nominal / noise", "extended / noise"], body))  # fmt: skip
     groups = {"single effects": lambda s: ":" not in s and "+" not in s, "pairs": lambda s: "+" in s,
               "nothing": lambda s: s.startswith("nothing:"), "outside": lambda s: s.startswith("outside:"),
@@ -198,8 +199,8 @@ def tables(rows: list[dict]) -> str:
                      f"{np.median(errors):.2%}" if errors else "",
                      f"{np.mean(np.array(errors) <= 0.1):.1%}" if errors else "",
                      f"{np.mean(covered):.1%} of {len(covered)}" if covered else ""])  # fmt: skip
-    out.append(lines_of(["group", "cases", "right (95 % interval)", "wrong name (95 % bound)", "median error", "within 10 %",
-                         "intervals that hold"], body))  # fmt: skip
+    out.append(lines_of(["group", "cases", "right (95 % interval)", "wrong name (95 % bound)", "median error",
+                         "within 10 %", "intervals that hold"], body))  # fmt: skip
     body = []
     for label, cell in by.items():
         if label.startswith("power:"):
