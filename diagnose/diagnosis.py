@@ -202,7 +202,7 @@ def _held_out(plant: Plant, episodes: list[Episode], driven: bool) -> list[int]:
     nominal = fit(problem, Candidate((), np.zeros(0)), Noise(k=noise_floor(problem)), fixed=True, iterations=4)
     power = np.array([float(np.mean(r * r)) for r in nominal.residuals])
     seen = [min(power[k].mean(), np.delete(power, k).mean()) for k in every]
-    return every[0] if seen[0] > 0.2 * power.mean() else every[int(np.argmax(seen))]
+    return every[0] if seen[0] > 4 * noise_floor(problem) ** 2 else every[int(np.argmax(seen))]
 
 
 def _cut(plant: Plant, episodes: list[Episode], names: list[str]) -> tuple[list[Episode], list[str]]:

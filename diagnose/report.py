@@ -7,9 +7,9 @@ import html
 import io
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from diagnose.diagnosis import Diagnosis
 
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -23,6 +23,8 @@ WORDS = {"consistent": "The model agrees with the data: what is left is noise.",
 
 def page(result: Diagnosis) -> str:
     """The whole page."""
+    from diagnose import figures
+
     d = result.data
     parts = [f"<h1>Diagnosis of joint {html.escape(result.plant.joint)}</h1>",
              f"<p class=verdict><b>{d['verdict']}</b>. {WORDS[d['verdict']]}</p>"]  # fmt: skip
@@ -30,14 +32,18 @@ def page(result: Diagnosis) -> str:
     for c in d["causes"]:
         if c["name"] == "unknown":
             e = c["evidence"]
-            parts.append(f"<p>{html.escape(e['why'])}; {html.escape(e['where'])}.</p>")
-            if e["partly"]:
-                parts.append(f"<p>Part of it looks like {html.escape(', '.join(e['partly']))}, without being sure.</p>")
+            parts += _remainder(e)
         for name, p in c["parameters"].items():
             lo, hi = p["ci95"]
             rows.append((c["name"], name, f"{p['value']:.4g} {p['unit']}", f"{lo:.4g} to {hi:.4g}"))
+    sentences = [f"<li><b>{c['name']}</b>. {html.escape(c['evidence']['sentence'])}</li>" for c in d["causes"]
+                 if "sentence" in c["evidence"]]  # fmt: skip
     if rows:
-        parts += ["<h2>Causes</h2>", _table(("cause", "parameter", "value", "95 % interval"), rows)]
+        parts += ["<h2>Causes</h2><ul>", *sentences, "</ul>",
+                  _table(("cause", "parameter", "value", "95 % interval"), rows),
+                  _image(figures.intervals(result), "how sure each parameter is")]  # fmt: skip
+    if "remainder" in d:
+        parts += ["<h2>What is left</h2>", *_remainder(d["remainder"])]
     if d["alternatives"]:
         text = "; ".join(" + ".join(a) for a in d["alternatives"])
         parts.append(f"<p>The data are explained as well by: {html.escape(text)}.</p>")
@@ -48,10 +54,13 @@ def page(result: Diagnosis) -> str:
         ("nominal model", f"{d['nominal']['heldout_rmse']:.4g}"), ("extended", f"{d['extended']['heldout_rmse']:.4g}"),
         ("noise floor", f"{d['noise_floor']:.4g}"),
         ("ratio", f"{g['heldout_rmse_ratio']:.3g} ({g['ci95'][0]:.3g} to {g['ci95'][1]:.3g})")]),
-        _image(_over_time(result)), "<h2>Where the nominal model's error lives</h2>", _image(_in_plane(result)),
-        "<h2>What was tried</h2>", _table(("causes", "nats behind the chosen", f"error of the fitted episodes, {u}"), [
-            (" + ".join(r["causes"]) or "nothing", f"{r['nats']:.1f}", f"{r['rmse']:.4g}")
-            for r in d["ranking"]]),
+        _image(figures.over_time(result), "measured, nominal and extended, and their errors, over time"),
+        "<h2>Where the nominal model's error lives</h2>",
+        _image(figures.in_plane(result), "the torque that the nominal model lacks"),
+        _image(figures.points(result), "points on the part against the joint's paths"),
+        *(["<h2>Free torques</h2><p>What would be needed beside the causes, over position and over velocity.</p>",
+           _image(figures.free_torques(result), "free torques")] if result.found.free is not None else []),
+        "<h2>What was tried</h2>", _image(figures.ranking(result), "sets of causes and how far behind they are"),
         "<h2>Assumptions</h2><ul>", *(f"<li>{html.escape(a)}</li>" for a in d["assumptions"]), "</ul>"]  # fmt: skip
     return (f"<!doctype html><html lang=en><meta charset=utf-8><title>Diagnosis</title><style>{STYLE}</style>"
             + "\n".join(parts) + "</html>\n")  # fmt: skip
@@ -62,58 +71,20 @@ def _table(head: tuple, rows: list[tuple]) -> str:
     return (f"<table><tr>{cells(head, 'th')}</tr>" + "".join(f"<tr>{cells(r, 'td')}</tr>" for r in rows) + "</table>")
 
 
-def _image(figure) -> str:
+def _remainder(e: dict) -> list[str]:
+    out = [f"<p>{html.escape(e['why'])}; {html.escape(e['where'])}.</p>"]
+    if e["explained_rmse"] > 0:
+        out.append(f"<p>What is left has an error of {e['rmse']:.3g} (the causes explain {e['explained_rmse']:.3g}), "
+                   f"{e['times_noise']:.1f} times the noise.</p>")  # fmt: skip
+    if e["partly"]:
+        out.append(f"<p>Part of it looks like {html.escape(', '.join(e['partly']))}, without being sure.</p>")
+    return out
+
+
+def _image(figure: Figure | None, words: str) -> str:
+    if figure is None:
+        return ""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, bbox_inches="tight")
-    return f'<p><img alt="" src="data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"></p>'
-
-
-def _over_time(result: Diagnosis):
-    """Measured, nominal and extended over time, and the residuals below."""
-    from matplotlib.figure import Figure
-
-    curves = list(result.curves.items())[:3]
-    figure = Figure(figsize=(4.2 * len(curves), 5), layout="constrained")
-    axes = figure.subplots(2, len(curves), sharex="col", squeeze=False)
-    unit = result.data["unit"]
-    for k, (name, c) in enumerate(curves):
-        top, low = axes[0, k], axes[1, k]
-        top.plot(c["time"], c["measured"], color="k", lw=2, label="measured")
-        top.plot(c["time"], c["nominal"], color="C3", lw=1, label="nominal")
-        top.plot(c["time"], c["extended"], color="C0", lw=1, ls="--", label="extended")
-        margin = 0.3 * np.ptp(c["measured"]) + 1e-9
-        top.set_ylim(c["measured"].min() - margin, c["measured"].max() + margin)
-        top.set_title(name, fontsize=9)
-        low.plot(c["time"], c["measured"] - c["nominal"], color="C3", lw=1)
-        low.plot(c["time"], c["measured"] - c["extended"], color="C0", lw=1)
-        low.axhspan(-2 * result.data["noise_floor"], 2 * result.data["noise_floor"], color="0.9", zorder=0)
-        low.set_xlabel("time, s")
-    axes[0, 0].legend(fontsize=8)
-    axes[0, 0].set_ylabel(unit)
-    axes[1, 0].set_ylabel(f"error, {unit}")
-    return figure
-
-
-def _in_plane(result: Diagnosis):
-    """The torque that the nominal model lacks: in the (q, velocity) plane, over q, over velocity by direction."""
-    from matplotlib.figure import Figure
-
-    m = result.fitted.motion
-    p = result.plant
-    figure = Figure(figsize=(12.6, 3.6), layout="constrained")
-    plane, over_q, over_v = figure.subplots(1, 3)
-    size = np.percentile(np.abs(m.residual), 98) + 1e-12
-    dots = plane.scatter(m.q, m.v, c=m.residual, s=3, cmap="coolwarm", vmin=-size, vmax=size)
-    figure.colorbar(dots, ax=plane, label=f"missing torque, {p.torque_unit}")
-    for forward, colour, word in ((True, "C1", "opening (velocity > 0)"), (False, "C4", "closing (velocity < 0)")):
-        some = (m.v > 0) == forward
-        over_q.plot(m.q[some], m.residual[some], ".", ms=2, color=colour, label=word)
-        over_v.plot(m.v[some], m.residual[some], ".", ms=2, color=colour)
-    over_q.legend(fontsize=8)
-    over_q.set_ylim(-1.3 * size, 1.3 * size)
-    over_v.set_ylim(-1.3 * size, 1.3 * size)
-    plane.set_xlabel(f"position, {p.unit}")
-    plane.set_ylabel(f"velocity, {p.unit}/s")
-    over_q.set_xlabel(f"position, {p.unit}")
-    over_v.set_xlabel(f"velocity, {p.unit}/s")
-    return figure
+    data = base64.b64encode(out.getvalue()).decode()
+    return f'<p><img alt="{html.escape(words)}" src="data:image/png;base64,{data}"></p>'
