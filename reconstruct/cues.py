@@ -38,6 +38,9 @@ class HandTrack:
             forward); NaN where not valid.
         score: (T,) presence score in [0, 1].
         valid: (T,) bool.
+        placed: (T, 21, 3) landmarks in metres in the camera's frame, where who made the cue measured them there; NaN
+            where not valid. None for a network that sees one picture: its distance is a guess.
+        placed_std: m, of each of those coordinates.
     """
 
     side: str
@@ -45,6 +48,8 @@ class HandTrack:
     metric: np.ndarray
     score: np.ndarray
     valid: np.ndarray
+    placed: np.ndarray | None = None
+    placed_std: float | None = None
 
 
 @dataclass(frozen=True)
@@ -103,7 +108,10 @@ class HandReference:
         side: "left" or "right".
         notes: what was assumed or could not be done.
         std: standard deviations of what stays open about the driving hand: ``depth`` and ``across`` (m, along and
-            across the viewing ray), ``size`` (relative), ``time`` (s), ``tips`` (m, a finger tip); empty without one.
+            across the viewing ray), ``size`` (relative), ``time`` (s), ``tips`` (m, a finger tip), ``offset`` (m, the
+            whole hand against the part); empty without one.
+        holds: convex parts, each (vertices (v, 3) m, faces (f, 3)), world frame at q = 0, that the hand must be holding
+            and the geometry does not show.
     """
 
     time: np.ndarray
@@ -114,3 +122,4 @@ class HandReference:
     side: str
     notes: tuple[str, ...] = field(default_factory=tuple)
     std: dict[str, float] = field(default_factory=dict)
+    holds: tuple[tuple[np.ndarray, np.ndarray], ...] = ()

@@ -40,6 +40,7 @@ MAX_PX = 1e5
 """Farther out no point of a picture is tracked: a track is taken as not visible there."""
 
 HAND_ARRAYS = ("joints_world", "joints_uv", "valid", "side")
+PLACED_STD = 0.01  # m, of a user's joints in space that state nothing: a good motion capture glove
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -250,9 +251,13 @@ def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.nd
     """The hand of ``hand.npz``, its joints turned from the world to each frame's camera axes.
 
     Args:
-        cue: joints_world (T, 21, 3) m, joints_uv (T, 21, 2) full px, valid (T,), side.
-        camera: T_world_camera (T, 4, 4) of ``camera.npz``, which joints_world refer to.
+        cue: joints_world (T, 21, 3) m, joints_uv (T, 21, 2) full px, valid (T,), side; optional std, m, of each
+            coordinate of joints_world.
+        camera: T_world_camera (T, 4, 4) of ``camera.npz``, which joints_world refer to, and ``metric``.
         mask: (T, h, w) hand pixels at working size; drawn from the landmarks when None.
+        maker: who made the cue. Where the camera is metric, a user's joints are taken as measured in space, and
+            anybody's who states ``std``; of a network's otherwise only their shape is used, and where they are in the
+            picture.
 
     Raises:
         TaaError: a shape is wrong, or there is no camera.
@@ -272,7 +277,17 @@ def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.nd
     centred = joints - joints.mean(axis=1, keepdims=True)
     metric = np.einsum("tji,tkj->tki", pose[:, :3, :3], centred)
     nan = np.where(valid, 1.0, np.nan)[:, None, None]
-    track = HandTrack(str(cue["side"]), uv * nan, metric * nan, valid.astype(float), valid)
+    placed, std = None, None
+    if booleans(camera.get("metric", np.array(True)), (), "metric of cues/camera.npz"):
+        if "std" in cue:
+            std = float(numbers(cue["std"], (), "std of cues/hand.npz"))
+            if not (np.isfinite(std) and std >= 0):
+                raise TaaError("std of cues/hand.npz must be one standard deviation of joints_world in metres")
+        elif maker.name == GIVEN.name:
+            std = PLACED_STD
+        if std is not None:
+            placed = np.einsum("tji,tkj->tki", pose[:, :3, :3], joints - pose[:, None, :3, 3]) * nan
+    track = HandTrack(str(cue["side"]), uv * nan, metric * nan, valid.astype(float), valid, placed, std)
     if mask is None:
         from reconstruct.providers.skin import hand_mask
 

@@ -360,6 +360,7 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
     from reconstruct.geometry.links import build_geometry
     from reconstruct.geometry.masks import segment_links
     from reconstruct.hand.align import align_hand
+    from reconstruct.hand.holds import holding
     from reconstruct.report import add_report
     from taa_envs.asset import load_asset
     from taa_envs.files import folder_written_whole
@@ -412,6 +413,8 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
                             "outside are refined with them")  # fmt: skip
     geometry = keep_clear(geometry, fit)
     reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
+    if reference.holds:
+        geometry = keep_clear(holding(geometry, reference.holds), fit)
     if folder:
         folder.write("masks", cues_io.mask_arrays(masks))
         folder.write("hand", cues_io.hand_arrays(reference, hands))

@@ -8,14 +8,15 @@ with the part; before and after, the hand follows what was seen, clear of the pa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reconstruct.cues import HandReference, Hands, LinkMasks
 from reconstruct.geometry import Geometry
 from reconstruct.hand.drive import Drive, close_gaps, find_drive, moving_frames, runs
-from reconstruct.hand.grip import ACROSS_STD, PRESS, RADII, RAY_STD, Grip, find_grips
+from reconstruct.hand.grip import ACROSS_STD, HALF_HAND, PRESS, RADII, RAY_STD, Grip, Sighting, find_grips
+from reconstruct.hand.holds import Part, assumed_handle
 from reconstruct.hand.path import clear_path, exit_direction
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.shape import LinkShape, drive_direction
@@ -28,6 +29,9 @@ FOUND_SECONDS = 0.15  # a hand that holds on so soon after it is found was holdi
 DEPTH_FLOOR, ACROSS_FLOOR = 0.01, 0.005  # m, least standard deviations of an aligned hand
 TIPS_STD = 0.005  # m of a finger tip: landmark noise of 4 % of a palm, and the 4 mm by which tips are pressed in
 REST_STD = 0.015  # m, how still a driving hand's tips are in the link's frame
+SURFACE_STD = 0.008  # m, of the geometry's surface: where a hand measured in space meets it
+HANDLE_COST = 6.0  # of assuming a handle, beside a grip's squared standard deviations
+DOUBT = 2.0  # standard deviations: a grip farther from where the hand was seen speaks against the geometry
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ def observe(hands: Hands, index: int, K: np.ndarray, rate: float) -> Seen:
     camera, _ = hand_positions(hand, K)
     valid = np.isfinite(camera[:, 0, 0])
     camera = _fill(camera, valid)
+    if hand.placed is not None:  # measured: nothing to smooth but the noise that it has
+        return Seen(_smooth(camera, 0.03 * rate), valid)
     # Depth errs in bursts of frames, the image place does not: smooth the depth alone, along the rays.
     depth = np.log(camera[..., 2].mean(1))
     half = max(1, round(0.15 * rate))
@@ -85,6 +91,12 @@ def _from_link(pose: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Link-frame points (N, 3) or (T, N, 3) -> world (T, N, 3)."""
     x = np.broadcast_to(x, (len(pose), *x.shape[-2:]))
     return np.einsum("tij,tnj->tni", pose[:, :3, :3], x) + pose[:, None, :3, 3]
+
+
+def _tip_spread(fit: JointFit, camera: np.ndarray, use: np.ndarray) -> float:
+    """Median distance, m, of finger tips from their middle place in the link's frame."""
+    tips = _to_link(fit.link_pose(fit.q[use]), _to_world(fit, camera[use]))[:, TIPS]
+    return float(np.median(np.linalg.norm(tips - np.median(tips, axis=0), axis=-1)))
 
 
 def depth_factor(fit: JointFit, shape: LinkShape, camera: np.ndarray, use: np.ndarray) -> tuple[float, float]:
@@ -176,9 +188,17 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     use = drive.drives & seen.valid
     if use.sum() < 3:
         return _absent(video, fit, shape, "the driving hand's position could not be computed")
-    factor, spread = depth_factor(fit, shape, seen.camera, use)
-    notes.append(f"hand depth times {factor:.2f} puts it at the part; it then stays within {1e3 * spread:.0f} mm "
-                 f"in the part's frame while it drives it")
+    measured = hand.placed is not None
+    if measured:
+        factor, spread = 1.0, _tip_spread(fit, seen.camera, use)
+        sighting = Sighting.measured(float(np.hypot(hand.placed_std or 0.0, SURFACE_STD)))
+        notes.append(f"hand taken where it was measured in space; its tips stay within {1e3 * spread:.0f} mm in the "
+                     "part's frame while it drives it")
+    else:
+        sighting = Sighting()
+        factor, spread = depth_factor(fit, shape, seen.camera, use)
+        notes.append(f"hand depth times {factor:.2f} puts it at the part; it then stays within {1e3 * spread:.0f} mm "
+                     f"in the part's frame while it drives it")
     world = _to_world(fit, seen.camera * factor)
     pose = fit.link_pose(fit.q)
     carried = _carried(drive, hand.valid, moving, rate)
@@ -188,18 +208,20 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
                      "assumed to hold on, carried with the part")
     sign = _stroke_sign(fit.q)
     forward = np.maximum(sign * np.gradient(fit.q), 0.0)
-    grips: list[Grip] = []
     weight = forward[use] if forward[use].sum() > 0 else np.abs(np.gradient(fit.q))[use]
     rest = rest_pose(_to_link(pose[use], world[use]), weight)
     key = int(np.flatnonzero(use)[weight.argmax()])
     centre = -fit.T_camera_world[:3, :3].T @ fit.T_camera_world[:3, 3]
     ray = pose[key, :3, :3].T @ (world[key].mean(0) - centre)
-    grips = find_grips(shape, fit, sign, rest, ray / np.linalg.norm(ray))
-    if not grips:
-        notes.append("no face of the part looks against its motion within the hand's reach: pose left as seen")
-        grips = [Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0, 0.0)]
-    grip = grips[0]
-    held = _from_link(pose, grip.pose) - _waiting(fit, pose, grip, moving, sign, rate)
+    ray = ray / np.linalg.norm(ray)
+    grip, shape, holds = _choose(shape, fit, sign, rest, ray, sighting, notes)
+    still = _from_link(pose, grip.pose)
+    if measured:  # what the hand does in the part's frame was measured too; only its correction is common to all frames
+        own = _to_link(pose, world)
+        for a, b in runs(attached):
+            own[a:b] = _smooth(own[a:b], 0.1 * rate)
+        still = _from_link(pose, own + (grip.pose - rest))
+    held = still - _waiting(fit, pose, grip, moving, sign, rate)
     joints = _assemble(shape, world, held, pose, attached, grip, rate)
     notes.append(f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
                  f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was "
@@ -207,21 +229,46 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     if grip.hidden > 1:
         notes.append("the part would hide this hand from the camera: the geometry lacks what the hand really held")
     return HandReference(time.copy(), fit.q.copy(), joints, seen.valid & ~carried, attached & moving, hand.side,
-                         tuple(notes), _uncertainty(grip, ray, rate))
+                         tuple(notes), _uncertainty(grip, ray, rate, hand.placed_std if measured else None), holds)
 
 
-def _uncertainty(grip: Grip, ray: np.ndarray, rate: float) -> dict[str, float]:
+def _choose(shape: LinkShape, fit: JointFit, sign: float, rest: np.ndarray, ray: np.ndarray, sighting: Sighting,
+            notes: list[str]) -> tuple[Grip, LinkShape, tuple[Part, ...]]:  # fmt: skip
+    """The grip nearest to the evidence, the link as it is then, and what had to be added to the link for it."""
+    grips = find_grips(shape, fit, sign, rest, ray, sighting=sighting)
+    if not grips or sighting.off(grips[0], ray) > DOUBT or grips[0].hidden > 1:
+        handle = assumed_handle(shape, fit, sign, rest)
+        if handle is not None:
+            parts, moved = handle
+            more = shape.with_parts(parts)
+            held = find_grips(more, fit, sign, moved, ray, sighting=sighting)
+            for k, grip in enumerate(held):  # its shift is from where the hand was seen, not from where it is clear
+                held[k] = replace(grip, shift=grip.shift + (moved - rest).mean(0))
+            if held and (not grips or held[0].cost + HANDLE_COST < grips[0].cost):
+                notes.append("no face of the part that the hand could have moved it by lies where the hand was seen: a "
+                             "handle is assumed before its finger tips")
+                return held[0], more, parts
+    if not grips:
+        notes.append("no face of the part looks against its motion within the hand's reach: pose left as seen")
+        return Grip(rest, "as seen", np.zeros(3), 0.0, 0, 0, 0.0), shape, ()
+    return grips[0], shape, ()
+
+
+def _uncertainty(grip: Grip, ray: np.ndarray, rate: float, measured: float | None) -> dict[str, float]:
     """What stays open about the demonstrated hand, standard deviations.
 
     Observation and contact disagree by how far the hand had to be moved to its grip; that is what either may be off
-    by, and never less than what the landmarks themselves are.
+    by, and never less than what the landmarks themselves are. Along the link's motion contact has settled where the
+    hand is, up to the tips' own error; across it only observation has: the whole hand's offset is that.
     """
-    ray = ray / np.linalg.norm(ray)
     along = float(grip.shift @ ray)
     aside = float(np.linalg.norm(grip.shift - along * ray))
-    return {"depth": min(float(np.hypot(DEPTH_FLOOR, along)), RAY_STD),
-            "across": min(float(np.hypot(ACROSS_FLOOR, aside)), ACROSS_STD),
-            "size": ADULT_SIZE_STD, "time": 1.0 / rate, "tips": TIPS_STD}
+    depth, across, size = DEPTH_FLOOR, ACROSS_FLOOR, ADULT_SIZE_STD
+    if measured is not None:
+        depth, across, size = measured, measured, min(ADULT_SIZE_STD, measured / HALF_HAND)
+    depth, across = (min(float(np.hypot(depth, along)), RAY_STD), min(float(np.hypot(across, aside)), ACROSS_STD))
+    return {"depth": depth, "across": across, "size": size, "time": 1.0 / rate, "tips": TIPS_STD,
+            "offset": float(np.hypot(across, TIPS_STD))}
 
 
 def _stroke_sign(q: np.ndarray) -> float:

@@ -21,13 +21,40 @@ from reconstruct.joint.models import JointFit
 PRESS = 0.004  # m by which pushing tips are aimed below the surface
 RAY_STD, ACROSS_STD = 0.05, 0.025  # m, what the image says about the hand along and across the viewing ray
 TURN_STD = np.deg2rad(25.0)
+TIPS = (4, 8, 12, 16, 20)
+HALF_HAND = 0.1  # m: a turn by an angle moves a hand's ends by so much a radian
 AGAINST = -0.55  # cosine between a pushed face's normal and the motion
 FINGER_REACH = 0.035  # m by which a finger may be bent onto the surface
 OCCLUDED = 9.0  # cost of each palm landmark that the link would hide from the camera
 PALM = (0, 2, 5, 9, 13, 17)
 AHEAD = np.array([0.01, 0.025, 0.045, 0.07, 0.1, 0.15])  # m towards the camera
+SURE = 0.008  # m
+IDLE = 2.0  # cost of each tip of the group that does not push
+SLIP = 2.0  # cost of each direction in which all of the push would be lost
 GROUPS = ((8, 12, 16), (8, 12), (8, 12, 16, 20), (4,), (4, 8, 12))
 """Finger tips that push together."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """How well it is known where the hand was: standard deviations along and across the viewing ray, m, and of its
+    turn, rad. The defaults are one picture's."""
+
+    ray: float = RAY_STD
+    across: float = ACROSS_STD
+    turn: float = float(TURN_STD)
+
+    @classmethod
+    def measured(cls, std: float) -> Sighting:
+        """Of a hand measured in space to std, m, a coordinate."""
+        return cls(std, std, std / HALF_HAND)
+
+    def off(self, grip: Grip, ray: np.ndarray) -> float:
+        """By how many standard deviations a grip is off where the hand was seen; ray (3,) unit."""
+        along = float(grip.shift @ ray)
+        aside = float(np.linalg.norm(grip.shift - along * ray))
+        return float(np.sqrt((along / self.ray) ** 2 + (aside / self.across) ** 2 + (grip.turn / self.turn) ** 2
+                             + (grip.bend / self.across) ** 2))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,6 +67,7 @@ class Grip:
         pushing: number of contact spheres on faces that look against the motion.
         hidden: number of palm landmarks that the link would hide from the camera.
         cost: smaller is nearer to the evidence.
+        bend: m, the farthest that bending a finger moved its tip.
     """
 
     pose: np.ndarray
@@ -49,6 +77,7 @@ class Grip:
     pushing: int
     hidden: int
     cost: float
+    bend: float = 0.0
 
 
 def _spheres() -> tuple[np.ndarray, np.ndarray]:
@@ -68,11 +97,11 @@ def penetration(shape: LinkShape, pose: np.ndarray) -> np.ndarray:
     return np.maximum(RADII - shape.distance(SPHERES @ pose)[0], 0.0)
 
 
-def _turns() -> list[Rotation]:
+def _turns(std: float) -> list[Rotation]:
     out = [Rotation.identity()]
-    for degrees in (25.0, 50.0):
+    for angle in (std, 2 * std):
         for axis in np.vstack([np.eye(3), -np.eye(3)]):
-            out.append(Rotation.from_rotvec(np.deg2rad(degrees) * axis))
+            out.append(Rotation.from_rotvec(angle * axis))
     return out
 
 
@@ -82,6 +111,15 @@ def _pushing(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray) -> 
     distance, normal = shape.distance(x)
     against = np.einsum("...i,...i->...", normal, drive_direction(fit, x, sign)) < AGAINST
     return against & (distance < RADII - 0.001)
+
+
+def _slips(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, pushing: int) -> float:
+    """Share of the push that is lost by a shift of :data:`SURE`, summed over four directions across the motion: at an
+    edge a hand whose place is known to a centimetre is as likely beside the link as on it, and would not stay on it."""
+    forward = drive_direction(fit, pose[list(TIPS)].mean(0), sign)
+    across = np.linalg.svd(forward[None])[2][1:]
+    left = [_pushing(shape, fit, sign, pose + s * SURE * u).sum() for u in across for s in (-1, 1)]
+    return sum(1.0 - min(1.0, float(n) / max(pushing, 1)) for n in left)
 
 
 def _overlap_cost(deep: np.ndarray, tips: tuple[int, ...]) -> np.ndarray:
@@ -97,20 +135,19 @@ def _hidden(shape: LinkShape, poses: np.ndarray, ray: np.ndarray) -> np.ndarray:
     return (shape.distance(ahead)[0] < -0.002).any(-1).sum(-1)
 
 
-def _bend(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, tips: tuple[int, ...], faces: np.ndarray
+def _bend(shape: LinkShape, pose: np.ndarray, tips: tuple[int, ...], points: np.ndarray, normals: np.ndarray
           ) -> np.ndarray:
-    """Bend the fingers of these tips so that the tips press on the given surface samples (indices)."""
+    """Bend the fingers of these tips so that the tips press on the given points (n, 3) of the surface."""
     out = pose.copy()
-    aims = shape.points[faces] + shape.normals[faces] * (RADII[tips[0]] - PRESS)
+    aims = points + normals * (RADII[tips[0]] - PRESS)
     for tip in tips:
         gap = np.linalg.norm(aims - out[tip], axis=1)
         k = int(gap.argmin())
         if gap[k] > FINGER_REACH:
             continue
         # Onto the face straight below the tip, not onto the nearest sample.
-        i = faces[k]
-        height = (out[tip] - shape.points[i]) @ shape.normals[i]
-        target = out[tip] - shape.normals[i] * (height - RADII[tip] + PRESS)
+        height = (out[tip] - points[k]) @ normals[k]
+        target = out[tip] - normals[k] * (height - RADII[tip] + PRESS)
         if shape.distance(target)[0] > RADII[tip] or np.linalg.norm(target - aims[k]) > 0.02:
             target = aims[k]
         finger = list(next(f for f in FINGERS if tip in f))
@@ -118,8 +155,25 @@ def _bend(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, tips: 
     return out
 
 
-def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, ray: np.ndarray, limit: int = 4
-               ) -> list[Grip]:
+def _around(shape: LinkShape, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Surface points (n, 3) m and normals next to the seen finger tips, denser than the shape's own samples: a handle
+    is a few of those."""
+    steps = np.arange(-0.02, 0.021, 0.005)
+    grid = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
+    x = (seen[list(TIPS), None] + grid).reshape(-1, 3)
+    height, normal = shape.distance(x)
+    x = x - height[:, None] * normal
+    on = np.abs(shape.distance(x)[0]) < 1e-5
+    free = shape.distance(x + 1e-3 * normal)[0] > 5e-4
+    cells = np.unique(np.round(x / 0.004).astype(int), axis=0, return_index=True)[1]
+    keep = np.zeros(len(x), bool)
+    keep[cells] = True
+    keep &= on & free
+    return x[keep], normal[keep]
+
+
+def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, ray: np.ndarray, limit: int = 4,
+               sighting: Sighting | None = None) -> list[Grip]:  # fmt: skip
     """Grips that can drive the link, nearest to the evidence first.
 
     Args:
@@ -129,27 +183,31 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
         seen: (21, 3) m, where the hand was seen, link frame.
         ray: (3,) unit viewing direction there, link frame.
         limit: at most this many, clearly different ones.
+        sighting: how well ``seen`` is known; default one picture's.
     """
-    direction = drive_direction(fit, shape.points, sign)
-    facing = np.einsum("ij,ij->i", shape.normals, direction)
-    arm = lever(fit, shape.points)
+    std = sighting or Sighting()
+    near_points, near_normals = _around(shape, seen)
+    surface, normals = np.concatenate([shape.points, near_points]), np.concatenate([shape.normals, near_normals])
+    facing = np.einsum("ij,ij->i", normals, drive_direction(fit, surface, sign))
+    arm = lever(fit, surface)
     useful = arm > 0.3 * arm.max()
     push, other = np.flatnonzero((facing < AGAINST) & useful), np.flatnonzero((facing > -AGAINST) & useful)
     if not len(push):
         return []
-    turns = _turns()
+    turns = _turns(std.turn)
     found: list[tuple[float, Grip]] = []
     for g, tips in enumerate(GROUPS):
         anchor = seen[list(tips)].mean(0)
-        aims = shape.points[push] + shape.normals[push] * (RADII[tips[0]] - PRESS)
+        # Brought to a face, or left where it was seen with only the fingers bent onto one.
+        aims = np.vstack([surface[push] + normals[push] * (RADII[tips[0]] - PRESS), anchor])
         d = aims - anchor
         along = d @ ray
         across = np.linalg.norm(d - along[:, None] * ray, axis=1)
-        prior = (along / RAY_STD) ** 2 + (across / ACROSS_STD) ** 2
+        prior = (along / std.ray) ** 2 + (across / std.across) ** 2
         # All places with the hand as it was seen, then the promising ones turned as well.
         poses = (seen - anchor)[None] + aims[:, None]
         rough = prior + _overlap_cost(penetration(shape, poses), tips) + OCCLUDED * _hidden(shape, poses, ray)
-        near = np.unique(np.concatenate([np.argsort(rough)[:60], np.argsort(prior)[:40]]))
+        near = np.unique(np.concatenate([np.argsort(rough)[:60], np.argsort(prior)[:40], [len(aims) - 1]]))
         best: list[tuple[float, int, int]] = []
         for k, turn in enumerate(turns):
             turned = turn.apply(seen - anchor)
@@ -158,28 +216,32 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
             x = poses[:, list(tips)]
             # Tips that float far off the surface cannot all be bent onto it.
             off = np.maximum(shape.distance(x)[0] - 0.02, 0).sum(1) / 0.02
-            cost = prior[near] + (turn.magnitude() / TURN_STD) ** 2 + _overlap_cost(deep, tips) + off
+            cost = prior[near] + (turn.magnitude() / std.turn) ** 2 + _overlap_cost(deep, tips) + off
             cost = cost + OCCLUDED * _hidden(shape, poses, ray)
             best += [(float(cost[j]), int(near[j]), k) for j in np.argsort(cost)[:4]]
         for _, j, k in sorted(best)[:10]:
             turn = turns[k]
             pose = turn.apply(seen - anchor) + aims[j]
-            bent = _bend(shape, fit, sign, pose, tips, push)
+            bent = _bend(shape, pose, tips, surface[push], normals[push])
             kind = "push"
             if 4 not in tips and len(other):
-                pinched = _bend(shape, fit, sign, bent, (4,), other)
+                pinched = _bend(shape, bent, (4,), surface[other], normals[other])
                 extra = _overlap_cost(penetration(shape, pinched), (*tips, 4)) - _overlap_cost(
                     penetration(shape, bent), (*tips, 4))
                 if not np.allclose(pinched[4], bent[4]) and extra < 1.0:
                     bent, kind = pinched, "pinch"
-            pushing = int(_pushing(shape, fit, sign, bent).sum())
+            pushes = _pushing(shape, fit, sign, bent)
+            pushing = int(pushes.sum())
             wrong = _overlap_cost(penetration(shape, bent), (*tips, 4) if kind == "pinch" else tips)
-            cost = prior[j] + (turn.magnitude() / TURN_STD) ** 2 + wrong + 4.0 * max(0, 3 - pushing) + 0.3 * g
+            cost = prior[j] + (turn.magnitude() / std.turn) ** 2 + wrong + 4.0 * max(0, 3 - pushing) + 0.3 * g
+            cost += SLIP * _slips(shape, fit, sign, bent, pushing) + IDLE * int((~pushes[list(tips)]).sum())
+            bend = float(np.linalg.norm(bent[list(tips)] - pose[list(tips)], axis=1).max())
+            cost += (bend / std.across) ** 2
             hidden = int(_hidden(shape, bent, ray))
             cost += OCCLUDED * hidden
             if pushing:
                 shift, angle = aims[j] - anchor, float(turn.magnitude())
-                found.append((float(cost), Grip(bent, kind, shift, angle, pushing, hidden, float(cost))))
+                found.append((float(cost), Grip(bent, kind, shift, angle, pushing, hidden, float(cost), bend)))
     found.sort(key=lambda item: item[0])
     out: list[Grip] = []
     for _, grip in found:

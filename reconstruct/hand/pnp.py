@@ -100,9 +100,12 @@ def hand_positions(hand: HandTrack, K: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
     Returns:
         (T, 21, 3) m, right-down-forward, NaN where the hand is not valid or no pose is plausible; and the standard
-        deviation (T,) of its depth, m, hand-size spread included.
+        deviation (T,) of its depth, m, hand-size spread included. Landmarks that were measured in space are returned
+        as they are, with their own.
     """
     n = len(hand.valid)
+    if hand.placed is not None:
+        return hand.placed.copy(), np.where(hand.valid, hand.placed_std or 0.0, np.nan)
     out, std = np.full((n, 21, 3), np.nan), np.full(n, np.nan)
     for t in np.flatnonzero(hand.valid):
         noise = PIXEL_STD * max(float(palm_pixels(hand.uv[t])), 1.0)

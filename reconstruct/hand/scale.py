@@ -13,6 +13,7 @@ from reconstruct.hand.skeleton import CONTACT, HAND_SIZE_STD
 from reconstruct.joint.models import JointFit
 
 MIN_FRAMES = 3
+TOUCH_STD = 0.03  # relative, depth of what a hand touches over that of the tracked points beside it
 
 
 def rescale(fit: JointFit, factor: float, factor_std: float, source: str) -> JointFit:
@@ -81,4 +82,6 @@ def hand_scale(fit: JointFit, hands: Hands, time: np.ndarray | None = None) -> J
     scatter = 1.4826 * float(np.median(np.abs(sure - middle)))
     # Neighbouring frames err alike: a handful of independent looks at most, and never below a third of the scatter.
     error = scatter / np.sqrt(min(len(sure) / 8.0 + 1.0, 9.0))
-    return rescale(fit, float(np.exp(middle)), float(np.hypot(HAND_SIZE_STD, error)), "hand")
+    # A hand measured in space knows its size; what is left is that it may touch something before or behind the points.
+    size = HAND_SIZE_STD if hand.placed is None else TOUCH_STD
+    return rescale(fit, float(np.exp(middle)), float(np.hypot(size, error)), "hand")

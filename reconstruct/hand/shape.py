@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from reconstruct.geometry import LinkMesh
@@ -19,6 +21,7 @@ class LinkShape:
 
         self.planes: list[np.ndarray] = []
         self.points, self.normals = np.zeros((0, 3)), np.zeros((0, 3))
+        self.link = link
         parts = [np.asarray(vertices, float) for vertices, _ in link.parts] or [np.asarray(link.vertices, float)]
         samples = []
         for vertices in parts:
@@ -46,6 +49,11 @@ class LinkShape:
         points, normals = np.concatenate(points), np.concatenate(normals)
         free = self.distance(points + 1e-3 * normals)[0] > 5e-4  # not where two parts meet
         self.points, self.normals = points[free], normals[free]
+
+    def with_parts(self, parts: tuple[tuple[np.ndarray, np.ndarray], ...]) -> LinkShape:
+        """The link with further convex parts, each (vertices (v, 3), faces (f, 3))."""
+        own = self.link.parts or ((self.link.vertices, self.link.faces),)
+        return LinkShape(replace(self.link, parts=(*own, *parts)))
 
     def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distance (...,) m, negative inside, and outward normal (..., 3) at x (..., 3)."""

@@ -155,6 +155,27 @@ def test_hand_joints_turn_into_camera_axes(video):
         cues_io.hands_from_cue(cue, None, video, None)
 
 
+def test_a_users_hand_is_measured_in_space_and_a_networks_is_not(video):
+    joints = RNG.random((T, 21, 3))
+    cue = {"joints_world": joints, "joints_uv": RNG.random((T, 21, 2)), "valid": np.arange(T) != 5,
+           "side": np.array("right")}  # fmt: skip
+    camera = {"T_world_camera": np.repeat(LOOK_DOWN_Y[None], T, 0)}
+    mask = np.zeros((T, H, W), bool)
+
+    def read(cue, camera=camera, maker=cues_io.GIVEN):
+        return cues_io.hands_from_cue(cue, camera, video, mask, maker).tracks[0]
+
+    hand = read(cue)
+    np.testing.assert_allclose(hand.placed[0] @ LOOK_DOWN_Y[:3, :3].T + LOOK_DOWN_Y[:3, 3], joints[0], atol=1e-12)
+    assert hand.placed_std == cues_io.PLACED_STD and np.isnan(hand.placed[5]).all()
+    assert read(cue, maker=MAKER).placed is None
+    assert read({**cue, "std": np.array(0.02)}, maker=MAKER).placed_std == 0.02
+    assert read(cue, {**camera, "metric": np.array(False)}).placed is None
+    for bad in (np.array(-1.0), np.array(np.nan), np.zeros(3)):
+        with pytest.raises(TaaError, match="std of cues/hand.npz"):
+            read({**cue, "std": bad})
+
+
 def test_masks_of_any_size_come_to_working_size(video):
     large = np.zeros((T, 2 * H, 2 * W), bool)
     large[:, : H // 2 * 2] = True
