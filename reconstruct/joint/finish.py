@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities
@@ -26,6 +27,8 @@ FLEX_PX = 1.0
 """How far real parts flex and tracks drift together, working px, once errors are seen to be shared at all."""
 MOST_FRAMES, MOST_TRACKS = 220, 400
 """Bounds of one bundle adjustment; further frames get their state afterwards, further tracks their point."""
+COARSE_FRAMES, FREE_FRAMES, MOST_STILL = 34, 100, 200
+"""The same where the camera's poses are unknown: six more numbers a frame make a step dear."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class Finished:
         spread: its uncertainty.  probability: of each type.
         rho: correlation of neighbouring tracks' errors.
         lasting: frames for which a track's error lasts.
+        view: focal length and camera, whose path is fitted together with the joint where it moves.
     """
 
     bundle: Bundle
@@ -47,6 +51,19 @@ class Finished:
     probability: dict[str, float]
     rho: float
     lasting: float
+    view: View
+
+
+@dataclass(frozen=True)
+class Still:
+    """The resting scene before a moving camera.
+
+    Attributes:
+        ids: (m,) its tracks.  X: (m, 3) their points in the world.
+    """
+
+    ids: np.ndarray
+    X: np.ndarray
 
 
 def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
@@ -108,11 +125,23 @@ class View:
         return Sightings(np.where(seen[..., None], uv, 0.0), seen, np.ones(len(uv)), self.focal, self.focal_std, R, t,
                          frames, lasting)  # fmt: skip
 
+    def corrected(self, b: Bundle, some: np.ndarray) -> View:
+        """The camera's path as a bundle adjustment of some frames found it; between them its correction is interpolated."""
+        assert self.R is not None and self.t is not None and b.R is not None and b.t is not None
+        every = np.arange(len(self.R))
+        turn = Rotation.from_matrix(b.R @ np.swapaxes(self.R[some], 1, 2))
+        R = Slerp(some, turn)(every).as_matrix() @ self.R
+        # The centre's correction, not the shift's: it is small where the turn is not.
+        here = -np.einsum("tji,tj->ti", self.R, self.t)
+        there = -np.einsum("tji,tj->ti", b.R, b.t) - here[some]
+        centre = here + np.stack([np.interp(every, some, there[:, k]) for k in range(3)], axis=1)
+        return replace(self, R=R, t=-np.einsum("tij,tj->ti", R, centre))
+
 
 Starts = Mapping[str, tuple[State, Observations] | Bundle]
 
 
-def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View) -> Finished:
+def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: Still | None = None) -> Finished:
     """Polish every type on the same tracks and decide between them.
 
     Args:
@@ -121,11 +150,11 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View) -> Finis
         uv: (N, T, 2) px from the principal point, NaN where not seen.
         ids: (n,) tracks that the answer is fitted to.
         view: focal length and camera.
+        still: the resting scene, where the camera moves and its path in `view` is but an estimate: it is refined
+            together with the joint, whose uncertainty then holds the camera's.
     """
     T = uv.shape[1]
-    some = np.arange(T)
-    if T > MOST_FRAMES:
-        some = np.unique(np.linspace(0, T - 1, MOST_FRAMES).round().astype(int))
+    some = _spread_out(T, MOST_FRAMES if still is None else COARSE_FRAMES)
     pick = np.arange(len(ids))
     if len(ids) > MOST_TRACKS:
         pick = np.linspace(0, len(ids) - 1, MOST_TRACKS).round().astype(int)
@@ -144,40 +173,91 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View) -> Finis
     pick = pick[keep]
     sight = replace(sight, uv=sight.uv[keep], seen=sight.seen[keep], weight=sight.weight[keep])
     best = {kind: polish(replace(b, X=b.X[keep]), sight) for kind, b in best.items()}
+    if still is not None:
+        best, sight = _together(best, sight, uv, still, view)
     lead = min(best.values(), key=lambda b: b.cost)
     r = residuals(lead, sight)
     # Gross outliers are not the noise.
     r = np.where((np.sum(r**2, axis=-1) < (4 * max(lead.sigma, 0.05)) ** 2)[..., None], r, 0.0)
-    rho, lasting = shared_error(r, sight.seen, clusters(lead)), lasting_error(r, sight.seen)
+    rho, lasting = shared_error(r, sight.seen, clusters(lead, sight.link)), lasting_error(r, sight.seen)
     # Errors that neighbours share are no noise: they stay for as long as the tracks do.
     alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / max(lead.sigma, 0.05) ** 2
     lasting = max(lasting, alike)
-    sight = replace(sight, weight=shared_weights(rho, clusters(lead)), lasting=lasting)
+    sight = replace(sight, weight=shared_weights(rho, clusters(lead, sight.link)), lasting=lasting)
     for kind, b in _across_kinds(best).items():
         best[kind] = min((polish(b, sight) for b in b), key=lambda b: b.cost)
     lead = best[_winner(type_probabilities(best, sight))]
     # Now that the motion is known, whatever follows it joins in, and the types are weighed on all of it.
     members = ids[pick]
+    if still is not None:
+        best, some, view = _on_frames(best, sight, uv, members, some, view)
+        sight, lead = replace(sight, link=None, free=False, frames=some), best[lead.kind]
     more, X = followers(lead, uv, np.setdiff1d(np.arange(len(uv)), members), view, sight)
     members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
     weight = shared_weights(rho, clusters(replace(lead, X=X)))
     sight = replace(view.sightings(uv[members], some, lasting), weight=weight)
-    bound = np.arange(len(members))
-    if len(members) > MOST_TRACKS:
-        bound = np.linspace(0, len(members) - 1, MOST_TRACKS).round().astype(int)
+    bound = _spread_out(len(members), MOST_TRACKS)
     few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=weight[bound])
     for kind, b in best.items():
         start = replace(b, X=X[bound])
         best[kind] = polish(start if b is lead else place_points(start, few), few, iterations=30)
+    if still is not None:
+        still = Still(np.setdiff1d(still.ids, members), still.X[~np.isin(still.ids, members)])
+        best, few = _together(best, few, uv, still, view, rho)
     probability = type_probabilities(best, few)
     last = best[_winner(probability)]
     sure = spread(last, few)
+    if few.link is not None:
+        view = view.corrected(last, some)
+        last = replace(last, X=last.X[few.link], R=None, t=None)
     b = place_points(replace(last, X=X), sight, rounds=4) if len(bound) < len(members) else last
     every = replace(view.sightings(uv[members], np.arange(T), lasting), weight=sight.weight)
     if len(some) < T:
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
-    return Finished(b, every, members, sure, probability, rho, lasting)
+    return Finished(b, every, members, sure, probability, rho, lasting, view)
+
+
+def _spread_out(count: int, most: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: Still, view: View, rho: float = 0.0):
+    """Joint and camera in one bundle adjustment: the bundles with the scene's points and poses, and its sightings."""
+    pick = _spread_out(len(still.ids), MOST_STILL)
+    scene = view.sightings(uv[still.ids[pick]], sight.frames)
+    X = still.X[pick]
+    both = replace(
+        sight,
+        uv=np.concatenate([sight.uv, scene.uv]),
+        seen=np.concatenate([sight.seen, scene.seen]),
+        weight=np.concatenate([sight.weight, scene.weight]),
+        link=np.arange(len(sight.uv) + len(X)) < len(sight.uv),
+        free=True,
+        R=scene.R,
+        t=scene.t,
+    )
+    out = {}
+    for kind, b in best.items():
+        one = replace(b, X=np.concatenate([b.X, X]), R=scene.R, t=scene.t)
+        if rho:
+            both = replace(both, weight=shared_weights(rho, clusters(one, both.link)))
+        out[kind] = polish(one, both)
+    return out, both
+
+
+def _on_frames(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, members: np.ndarray, some: np.ndarray,
+               view: View):  # fmt: skip
+    """The link alone again, on as many frames as the last bundle adjustment takes, before the camera found so far."""
+    lead = min(best.values(), key=lambda b: b.cost)
+    view = view.corrected(lead, some)
+    more = _spread_out(uv.shape[1], FREE_FRAMES)
+    every = view.sightings(uv[members], np.arange(uv.shape[1]))
+    out = {}
+    for kind, b in best.items():
+        b = states_of_all_frames(replace(b, X=b.X[sight.link], R=None, t=None), every, some)
+        out[kind] = replace(b, q=b.q[more] - b.q[more[0]])
+    return out, more, view
 
 
 def _winner(probability: dict[str, float]) -> str:
@@ -191,7 +271,7 @@ SURE = 20.0
 def followers(
     b: Bundle, uv: np.ndarray, ids: np.ndarray, view: View, like: Sightings, most: int = 800
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Further tracks that move with the link, however little: those near the axis hold it best.
+    """Further tracks that move with the link rather than rest, however little: those near the axis hold it best.
 
     Args:
         b: the fitted joint.  uv: (N, T, 2) of all tracks.  ids: (m,) those to look at.
@@ -213,7 +293,11 @@ def followers(
     own = len(b.X)
     trial = place_points(replace(b, X=np.tile(np.median(b.X, axis=0), (len(ids), 1))), s)
     r = residuals(trial, s)
-    rest = np.where(s.seen[..., None], s.uv - np.nanmedian(uv[ids][:, like.frames], axis=1)[:, None], 0.0)
+    if view.R is None:
+        rest = np.where(s.seen[..., None], s.uv - np.nanmedian(uv[ids][:, like.frames], axis=1)[:, None], 0.0)
+    else:
+        resting = replace(b, q=np.zeros_like(b.q), X=trial.X)
+        rest = residuals(place_points(resting, s), s)
     limit = ROBUST_SIGMAS * sigma
     cost = lambda e: np.sum(s.seen * limit**2 * (1 - limit**2 / (limit**2 + np.sum(e**2, axis=-1))), axis=1)  # noqa: E731
     gain = (cost(rest) - cost(r)) / (2 * sigma**2 * like.lasting)

@@ -9,9 +9,10 @@ import numpy as np
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
-from reconstruct.joint.cameras import camera_moves, joints_between, rigid_group
+from reconstruct.joint.cameras import camera_moves, joints_between, scene_and_link
 from reconstruct.joint.evidence import bridged, free_motion
-from reconstruct.joint.finish import Finished, View, finish
+from reconstruct.joint.finish import Finished, Still, View, finish
+from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
 from reconstruct.joint.select import explained, key_frames, motion_stretches, observations, search
@@ -195,22 +196,20 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
 def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, tracks: int, seed: int) -> JointFit:
     """The joint between the two largest rigid groups of tracks (N, T, 2), px from the principal point.
 
-    None if there is no group, or nothing beside it.
+    None if there are no two groups.
     """
-    everything = np.ones(len(uv), bool)
-    static = rigid_group(uv, view.focal, everything, seed)
-    if static is None or static.members.mean() > 0.9:
+    bodies = two_bodies(uv, view.focal, seed)
+    if bodies is None:
         return None
-    link = rigid_group(uv, view.focal, ~static.members, seed)
-    if link is None:
-        return JointFit("refused", "the camera moves and nothing else: no second rigid group of tracks", tracks=tracks)
+    static, link = scene_and_link(*bodies)
     starts = joints_between(static, link)
-    view = View(view.focal, 0.0, static.R, static.t)
-    done = finish(starts, uv, np.flatnonzero(link.members), view)
+    view = View(view.focal, view.focal_std, static.R, static.t)
+    still = Still(np.flatnonzero(static.members), static.X[static.members])
+    done = finish(starts, uv, np.flatnonzero(link.members), view, still)
     if reason := _why_not_believed(done):
         return JointFit("refused", reason, tracks=tracks, inliers=len(done.members))
     note = f"; the camera moves: its path is fitted to {int(static.members.sum())} static tracks"
-    return _result(video, done, full_focal, tracks, note, KNOWN_STD)
+    return _result(video, done, full_focal, tracks, note, KNOWN_STD if view.focal_std == 0 else None)
 
 
 def _why_not_believed(done: Finished) -> str | None:

@@ -1,8 +1,8 @@
 """Maximum-likelihood bundle adjustment of one joint over all tracks and all frames.
 
-Unknown: the twist (see twist.py), the state in every frame, every track's point in 3D and, where it is not given, the
-focal length. The points are eliminated (Schur complement, 3 x 3 blocks), so that a step costs one dense solve in the
-number of frames. The loss is Geman-McClure's with a scale that follows the measured noise: near to efficient for
+Unknown: the twist (see twist.py), the state in every frame, every track's point in 3D and, where they are not given, the
+focal length and the camera's pose in every frame, which tracks of the resting scene then hold. The points are
+eliminated (Schur complement, 3 x 3 blocks), so that a step costs one dense solve in the number of frames. The loss is Geman-McClure's with a scale that follows the measured noise: near to efficient for
 Gaussian noise, and stray observations drop out.
 """
 
@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.twist import Twist
+from reconstruct.joint.twist import Twist, skew
 
 BEND = 0.1
 """Standard deviation of q's second difference over its range: weak, it decides only where few tracks are seen."""
@@ -22,7 +23,7 @@ ROBUST_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class Sightings:
-    """Observations of one link.
+    """Observations of one link, and of the resting scene where the camera's path is unknown.
 
     Attributes:
         uv: (N, T, 2) px from the principal point (0 where not seen).  seen: (N, T) bool.
@@ -31,6 +32,8 @@ class Sightings:
         R, t: (T, 3, 3), (T, 3) world to camera; None for a static camera, whose frame is the world then.
         frames: (T,) frame numbers; 0 .. T-1 when None.
         lasting: frames over which a track's error stays alike: so many observations weigh against a prior as one.
+        link: (N,) bool, on the link (the others rest); all of them when None.
+        free: True if the camera's poses are unknown, R and t but a start; the world is the first camera then.
     """
 
     uv: np.ndarray
@@ -42,6 +45,13 @@ class Sightings:
     t: np.ndarray | None = None
     frames: np.ndarray | None = None
     lasting: float = 1.0
+    link: np.ndarray | None = None
+    free: bool = False
+
+    @property
+    def scaleless(self) -> bool:
+        """True if nothing but the link's own depth can be the unit of length."""
+        return self.R is None or self.free
 
     @property
     def bend(self) -> np.ndarray:
@@ -60,6 +70,7 @@ class Bundle:
         kind: "revolute", "prismatic" or "screw".  twist: the joint.  q: (T,) path length at the anchor, q[0] = 0.
         X: (N, 3) points at q = 0, world.  log_focal: correction of the focal length's logarithm.
         cost: robust cost in px^2.  sigma: noise of one coordinate, px.
+        R, t: world to camera where the poses are fitted too, else None.
     """
 
     kind: str
@@ -69,6 +80,8 @@ class Bundle:
     log_focal: float = 0.0
     cost: float = np.inf
     sigma: float = 1.0
+    R: np.ndarray | None = None
+    t: np.ndarray | None = None
 
 
 def positions(b: Bundle, s: Sightings) -> tuple[np.ndarray, np.ndarray]:
@@ -76,9 +89,12 @@ def positions(b: Bundle, s: Sightings) -> tuple[np.ndarray, np.ndarray]:
     R, p = b.twist.pose(b.q)
     y = np.einsum("tij,nj->nti", R, b.X - b.twist.anchor)
     world = y + p + b.twist.anchor
-    if s.R is None:
+    if s.link is not None:
+        world[~s.link] = b.X[~s.link, None]
+    camera, shift = (s.R, s.t) if b.R is None else (b.R, b.t)
+    if camera is None:
         return world, world
-    return world, np.einsum("tij,ntj->nti", s.R, world) + s.t
+    return world, np.einsum("tij,ntj->nti", camera, world) + shift
 
 
 def residuals(b: Bundle, s: Sightings, cam: np.ndarray | None = None) -> np.ndarray:
@@ -114,11 +130,12 @@ def robust_loss(r: np.ndarray, s: Sightings, scale: float) -> tuple[float, np.nd
 
 @dataclass(frozen=True)
 class Normal:
-    """Gauss-Newton blocks: dense (twist, focal, q), points, coupling.
+    """Gauss-Newton blocks: dense (twist, focal, q, and six numbers of each free camera), points, coupling.
 
     Attributes:
         H: (P, P).  g: (P,).  Hp: (N, 3, 3).  gp: (N, 3).  C: (P, N, 3).  Z: (6, G) tangent basis of the twist.
         scores: (N, P) each track's part of g.
+        lead: number of unknowns before q.
     """
 
     H: np.ndarray
@@ -128,6 +145,15 @@ class Normal:
     C: np.ndarray
     Z: np.ndarray
     scores: np.ndarray
+    lead: int
+
+    def held(self, S: np.ndarray, right: np.ndarray, T: int) -> tuple[np.ndarray, np.ndarray]:
+        """The reduced system with q[0] and the first camera held still."""
+        S, right = S.copy(), right.copy()
+        fixed = [self.lead, *range(self.lead + T, min(self.lead + T + 6, len(S)))]
+        S[fixed], S[:, fixed], right[fixed] = 0.0, 0.0, 0.0
+        S[fixed, fixed] = np.trace(S) / len(S)
+        return S, right
 
     def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Schur complement, its right side, and the points' inverse blocks."""
@@ -143,7 +169,7 @@ class Normal:
 def normal_equations(
     b: Bundle, s: Sightings, world: np.ndarray, cam: np.ndarray, r: np.ndarray, w: np.ndarray
 ) -> Normal:
-    """Blocks of the weighted problem; parameters are (twist tangent, log focal, q_1 .. q_T)."""
+    """Blocks of the weighted problem; parameters are (twist tangent, log focal, q_1 .. q_T, cameras)."""
     N, T = s.seen.shape
     f = s.focal * np.exp(b.log_focal)
     z = np.maximum(cam[..., 2], 1e-3)
@@ -151,11 +177,15 @@ def normal_equations(
     P = np.zeros((N, T, 2, 3))
     P[..., 0, 0] = P[..., 1, 1] = f / z
     P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
-    if s.R is not None:
-        P = P @ s.R
+    in_camera = P
+    camera = s.R if b.R is None else b.R
+    if camera is not None:
+        P = P @ camera
     tw = b.twist
     R, p = tw.pose(b.q)
     Jx = P @ R
+    if s.link is not None:
+        Jx[~s.link] = P[~s.link]
     Z = tw.tangent(b.kind)
 
     by_d = tw.displacement_by_direction(b.q) @ Z[:3]  # (T, 3, G)
@@ -164,10 +194,14 @@ def normal_equations(
     y = world - p - tw.anchor
     dX = by_d + by_w + np.cross(turn.swapaxes(-1, -2)[None], y[:, :, None]).swapaxes(-1, -2)  # (N, T, 3, G)
     Jg = P @ dX
+    if s.link is not None:
+        Jg[~s.link] = 0.0
     if s.focal_std > 0:
         Jf = (f * cam[..., :2] / z[..., None])[..., None]
         Jg = np.concatenate([Jg, Jf], axis=-1)
     Jq = (P @ (np.cross(tw.curvature, world - tw.anchor) + tw.direction)[..., None])[..., 0]
+    if s.link is not None:
+        Jq[~s.link] = 0.0
     A = Jg.shape[-1]
     wr = w[..., None] * r
     wJg = w[..., None, None] * Jg
@@ -188,7 +222,25 @@ def normal_equations(
     C[:A] = (wJg.reshape(N, 2 * T, A).swapaxes(1, 2) @ Jx2).swapaxes(0, 1)
     C[A:] = np.einsum("nti,ntij->tnj", wJq, Jx)
     scores = np.concatenate([np.einsum("ntia,nti->na", wJg, r), np.sum(wJq * r, axis=-1)], axis=1)
-    return Normal(H, g, Hp, gp, C, Z, scores)
+    if not s.free:
+        return Normal(H, g, Hp, gp, C, Z, scores, A)
+    Jc = np.concatenate([in_camera @ -skew(cam - b.t), in_camera], axis=-1)  # (N, T, 2, 6)
+    wJc = w[..., None, None] * Jc
+    size = A + T + 6 * T
+    full, right = np.zeros((size, size)), np.zeros(size)
+    full[: A + T, : A + T], right[: A + T] = H, g
+    by_twist = np.einsum("ntip,ntia->tpa", wJc, Jg, optimize=True)
+    by_q = np.einsum("ntip,nti->tp", wJc, Jq)
+    own = np.einsum("ntip,ntir->tpr", wJc, Jc, optimize=True)
+    for k in range(T):
+        rows = slice(A + T + 6 * k, A + T + 6 * k + 6)
+        full[rows, rows] = own[k]
+        full[rows, :A], full[:A, rows] = by_twist[k], by_twist[k].T
+        full[rows, A + k], full[A + k, rows] = by_q[k], by_q[k]
+    pull = np.einsum("ntip,nti->ntp", wJc, r).reshape(N, 6 * T)
+    right[A + T :] = pull.sum(0)
+    coupling = (np.swapaxes(wJc, -1, -2) @ Jx).reshape(N, 6 * T, 3).swapaxes(0, 1)
+    return Normal(full, right, Hp, gp, np.concatenate([C, coupling]), Z, np.concatenate([scores, pull], axis=1), A)
 
 
 def _prior(b: Bundle, s: Sightings, noise2: float) -> tuple[float, int]:
@@ -223,14 +275,14 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
             if row >= 0:
                 n.H[row, row] += pull
                 n.g[row] += pull * b.log_focal
-            A = len(n.H) - T
-            n.H[A:, A:] += stiff
-            n.g[A:] += stiff @ b.q
+            A = n.lead
+            n.H[A : A + T, A : A + T] += stiff
+            n.g[A : A + T] += stiff @ b.q
             better = False
             for _ in range(5):
                 S, rhs, inv = n.reduced(damping)
-                # States that nothing observes stay where they are; q[0] is the gauge.
-                S[A, A] += 1e6 * np.trace(S) / len(S)
+                # States that nothing observes stay where they are.
+                S, rhs = n.held(S, rhs, T)
                 S = S + damping * np.diag(np.diag(S)) + 1e-10 * np.trace(S) / len(S) * np.eye(len(S))
                 try:
                     step = -np.linalg.solve(S, rhs)
@@ -255,16 +307,19 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
 
 
 def _stepped(b: Bundle, n: Normal, step: np.ndarray, dX: np.ndarray, row: int) -> Bundle:
-    T = len(b.q)
-    A = len(step) - T
-    G = n.Z.shape[1]
+    T, A, G = len(b.q), n.lead, n.Z.shape[1]
     limit = 0.5 * np.linalg.norm(b.X, axis=1, keepdims=True)
     size = np.linalg.norm(dX, axis=1, keepdims=True)
     X = b.X + dX * np.minimum(1.0, limit / np.maximum(size, 1e-12))
-    q = b.q + step[A:]
+    q = b.q + step[A : A + T]
     twist = b.twist.moved(n.Z @ step[:G], b.kind)
     log_focal = b.log_focal + (float(step[row]) if row >= 0 else 0.0)
-    return replace(b, twist=twist, q=q - q[0], X=X, log_focal=log_focal)
+    b = replace(b, twist=twist, q=q - q[0], X=X, log_focal=log_focal)
+    if len(step) == A + T:
+        return b
+    by_camera = step[A + T :].reshape(T, 6).copy()
+    by_camera[0] = 0.0
+    return replace(b, R=Rotation.from_rotvec(by_camera[:, :3]).as_matrix() @ b.R, t=b.t + by_camera[:, 3:])
 
 
 def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
@@ -284,7 +339,10 @@ def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
         P = np.zeros((*z.shape, 2, 3))
         P[..., 0, 0] = P[..., 1, 1] = f / z
         P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
-        J = (P if s.R is None else P @ s.R) @ b.twist.pose(b.q)[0]
+        camera = s.R if b.R is None else b.R
+        J = (P if camera is None else P @ camera) @ b.twist.pose(b.q)[0]
+        if s.link is not None:
+            J[~s.link] = (P if camera is None else P @ camera)[~s.link]
         H = np.einsum("nt,ntij,ntik->njk", w, J, J, optimize=True)
         g = np.einsum("nt,ntij,nti->nj", w, J, r, optimize=True)
         H += (1e-4 * np.trace(H, axis1=1, axis2=2) / 3 + 1e-12)[:, None, None] * np.eye(3)

@@ -44,10 +44,13 @@ class Spread:
     inflation: float
 
 
-def clusters(b: Bundle, cell: float = CELL) -> np.ndarray:
-    """(N,) cluster number of each track: cells of space on the link."""
-    size = np.linalg.norm(np.quantile(b.X, 0.9, axis=0) - np.quantile(b.X, 0.1, axis=0))
-    key = np.floor((b.X - np.median(b.X, axis=0)) / max(cell * size, 1e-9)).astype(int)
+def clusters(b: Bundle, link: np.ndarray | None = None, cell: float = CELL) -> np.ndarray:
+    """(N,) cluster number of each track: cells of space on the link, and on what rests beside it."""
+    link = np.ones(len(b.X), bool) if link is None else link
+    own = b.X[link]
+    size = np.linalg.norm(np.quantile(own, 0.9, axis=0) - np.quantile(own, 0.1, axis=0))
+    key = np.floor((b.X - np.median(own, axis=0)) / max(cell * size, 1e-9)).astype(int)
+    key = np.concatenate([key, link[:, None]], axis=1)
     return np.unique(key, axis=0, return_inverse=True)[1].ravel()
 
 
@@ -95,25 +98,28 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     _, w = robust_loss(r, s, ROBUST_SIGMAS * max(b.sigma, 0.05))
     n = normal_equations(b, s, world, cam, r, w)
     T = s.seen.shape[1]
-    A = len(n.H) - T
+    A = n.lead
+    link = np.ones(len(b.X), bool) if s.link is None else s.link
     G = n.Z.shape[1]
     tw = b.twist
     S, _, inv = n.reduced(0.0)
     if s.focal_std > 0:
         S[G, G] += b.sigma**2 * s.lasting / s.focal_std**2
-    # Gauges: q[0], and with one static camera the scale about its centre.
-    S[A, A] += 1e8 * np.trace(S) / len(S)
+    # Gauges: q[0], the first camera, and the scale about its centre.
+    S, _ = n.held(S, np.zeros(len(S)), T)
     v0 = tw.direction - np.cross(tw.curvature, tw.anchor)
-    if s.R is None:
+    if s.scaleless:
         rate = tw.direction @ v0
         null = np.zeros(len(S))
         null[:G] = n.Z.T @ np.concatenate([v0 - tw.direction * rate, -tw.curvature * rate])
-        null[A:] = b.q * rate
+        null[A : A + T] = b.q * rate
+        if s.free:
+            null[A + T :] = np.concatenate([np.zeros_like(b.t), b.t], axis=1).ravel()
         null /= np.linalg.norm(null)
         S = S + np.trace(S) * np.outer(null, null)
     B = np.linalg.inv(S + 1e-12 * np.trace(S) / len(S) * np.eye(len(S)))
     scores = n.scores - np.einsum("pni,nij,nj->np", n.C, inv, n.gp)
-    cluster = clusters(b)
+    cluster = clusters(b, link)
     groups = np.zeros((cluster.max() + 1, len(S)))
     np.add.at(groups, cluster, scores)
     used = max(len(groups) - 1, 1)
@@ -129,12 +135,12 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     by_d, by_w = np.zeros((3, len(S))), np.zeros((3, len(S)))
     by_d[:, :G], by_w[:, :G] = n.Z[:3], n.Z[3:]
     # Mean depth of the link's points, the unit of length.
-    unit = float(b.X[:, 2].mean())
-    by_unit = -np.einsum("nj,pnj->p", inv[:, 2], n.C) / len(b.X)
-    own = white * float(inv[:, 2, 2].sum()) / len(b.X) ** 2
+    unit = float(b.X[link, 2].mean())
+    by_unit = -np.einsum("nj,pnj->p", inv[link, 2], n.C[:, link]) / link.sum()
+    own = white * float(inv[link, 2, 2].sum()) / link.sum() ** 2
     by_q = np.zeros((T, len(S)))
     by_q[np.arange(T), A + np.arange(T)] = 1.0
-    if s.R is not None:
+    if not s.scaleless:
         by_unit, own = np.zeros_like(by_unit), 0.0
     if b.kind == "prismatic":
         axis = by_d

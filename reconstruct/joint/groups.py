@@ -1,0 +1,407 @@
+"""Rigid groups among tracks of one calibrated camera, and the camera's path against each of them.
+
+A small neighbourhood of tracks is nearly a plane, and a plane's points are known once its slope is: inverse depth is
+linear in the picture. So the search is over slopes, two numbers: for each, all poses follow one after the other from
+3D to 2D (resection), and the slope under which all key frames fit is right. It does not matter whether the body is flat,
+which is where two views with an essential matrix fail, and the mirror image that a plane in weak perspective has is just
+another slope. From there the body grows: points from poses, poses from points, further tracks that fit, and a bundle
+adjustment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from reconstruct.joint.polish import noise
+from reconstruct.joint.twist import skew
+
+MIN_GROUP = 15
+KEYS = 20
+SEEDS = 18
+PATCH = (14, 30)
+"""Tracks of a neighbourhood: small ones lie on one body, large ones hold their slope better."""
+TILTS_DEG = (25.0, 45.0, 60.0, 70.0, 78.0)
+GROWN = 6
+"""Neighbourhoods that are grown to bodies."""
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """A rigid body and the camera's path about it.
+
+    Attributes:
+        R, t: (T, 3, 3), (T, 3) body to camera; the body's frame is the first camera, its median depth 1.
+        X: (N, 3) points of all tracks (meaningful for members).
+        members: (N,) bool.  sigma: noise of one coordinate, px.
+        cost: (N,) mean loss of each track's observations under this motion, in [0, 1]; 1 where it is not seen.
+    """
+
+    R: np.ndarray
+    t: np.ndarray
+    X: np.ndarray
+    members: np.ndarray
+    sigma: float
+    cost: np.ndarray
+
+
+def two_bodies(uv: np.ndarray, focal: float, seed: int = 0) -> tuple[Rigid, Rigid] | None:
+    """The two largest rigid groups, every track with the one that it fits better; None if there are none.
+
+    Args:
+        uv: (N, T, 2) px from the principal point, NaN where not seen.  focal: px.
+    """
+    everything = np.ones(len(uv), bool)
+    one = rigid_group(uv, focal, everything, seed)
+    if one is None:
+        return None
+    other = rigid_group(uv, focal, ~one.members, seed)
+    if other is None:
+        return None
+    for _ in range(2):
+        # What fits both (short tracks, points near the hinge) is not asked.
+        clear = 0.7
+        mine, theirs = one.cost < clear * other.cost, other.cost < clear * one.cost
+        if min((one.members & mine).sum(), (other.members & theirs).sum()) < MIN_GROUP:
+            break
+        one, other = regrown(uv, focal, one, mine), regrown(uv, focal, other, theirs)
+    return one, other
+
+
+def rigid_group(uv: np.ndarray, focal: float, candidates: np.ndarray, seed: int = 0) -> Rigid | None:
+    """The largest rigid group among tracks.
+
+    Args:
+        uv: (N, T, 2) px from the principal point, NaN where not seen.
+        focal: px.
+        candidates: (N,) bool.
+
+    Returns:
+        None if no group of MIN_GROUP tracks is found.
+    """
+    rng = np.random.default_rng(seed)
+    x = uv / focal
+    keys = np.unique(np.linspace(0, uv.shape[1] - 1, KEYS).round().astype(int))
+    xk = x[:, keys]
+    seen = np.isfinite(xk[..., 0]) & candidates[:, None]
+    long = np.flatnonzero(seen.sum(1) >= max(6, 0.5 * len(keys)))
+    if len(long) < MIN_GROUP:
+        long = np.flatnonzero(seen.sum(1) >= 6)
+    if len(long) < MIN_GROUP:
+        return None
+    starts: list[tuple[float, np.ndarray, np.ndarray, int]] = []
+    spread = _farthest(xk[long], min(SEEDS, len(long)), rng)
+    for n, seed_track in enumerate(long[spread]):
+        patch, r = _neighbours(xk, seen, seed_track, PATCH[n % len(PATCH)])
+        if len(patch) < 8:
+            continue
+        for cost, R, t in _paths_of_patch(xk[patch], seen[patch], r, focal):
+            X = _triangulated(xk, seen, R, t)
+            loss = _track_cost(xk, seen, R, t, X, focal, 6.0)
+            worth = float(np.sum((1 - loss) * seen.sum(1)))
+            starts.append((worth, R, t, cost))
+    if not starts:
+        return None
+    starts.sort(key=lambda s: -s[0])
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    for _, R, t, _ in starts[:GROWN]:
+        grown = _grow(xk, seen, R, t, focal)
+        if grown is not None and (best is None or grown[0] > best[0]):
+            best = grown
+    if best is None:
+        return None
+    _, R, t, members = best
+    return _whole(x, candidates, keys, R, t, members, focal)
+
+
+def regrown(uv: np.ndarray, focal: float, body: Rigid, candidates: np.ndarray) -> Rigid:
+    """The same body from other tracks."""
+    x = uv / focal
+    T = uv.shape[1]
+    keys = np.unique(np.linspace(0, T - 1, KEYS).round().astype(int))
+    return _whole(x, candidates, keys, body.R[keys], body.t[keys], body.members & candidates, focal) or body
+
+
+def _farthest(xk: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of tracks that lie far from each other in some picture (farthest-point sampling)."""
+    filled = np.nan_to_num(xk - np.nanmean(xk, axis=1, keepdims=True)) + np.nanmean(xk, axis=1, keepdims=True)
+    flat = filled.reshape(len(xk), -1)
+    chosen = [int(rng.integers(len(xk)))]
+    gap = np.full(len(xk), np.inf)
+    for _ in range(count - 1):
+        gap = np.minimum(gap, np.linalg.norm(flat - flat[chosen[-1]], axis=1))
+        # Strays are far from everything: of the far ones, a random one.
+        far = np.argsort(-gap)[: max(2, len(gap) // 4)]
+        chosen.append(int(rng.choice(far)))
+    return np.array(chosen)
+
+
+def _neighbours(xk: np.ndarray, seen: np.ndarray, track: int, count: int) -> tuple[np.ndarray, int]:
+    """Tracks that stay near one in all pictures, and the key frame that sees most of them."""
+    both = seen & seen[track]
+    enough = both.sum(1) >= max(5, 0.6 * seen[track].sum())
+    gap = np.where(both, np.linalg.norm(np.nan_to_num(xk - xk[track]), axis=-1), 0.0).max(1)
+    gap[~enough] = np.inf
+    order = np.argsort(gap)[:count]
+    order = order[np.isfinite(gap[order])]
+    return order, int(np.argmax(seen[order].sum(0))) if len(order) else 0
+
+
+def _paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep: int = 2):
+    """The camera's path about a nearly flat patch: the best slopes' (cost, R, t), the patch's depth about 1.
+
+    Args:
+        x: (n, K, 2) rays.  seen: (n, K) bool.  r: key frame in which the slope is written.
+    """
+    use = seen[:, r]
+    x, seen = np.nan_to_num(x[use]), seen[use]
+    if len(x) < 6:
+        return []
+    K = x.shape[1]
+    tilt = np.tan(np.radians(TILTS_DEG))
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    slopes = np.concatenate([[[0.0, 0.0]], (tilt[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], -1)).reshape(-1, 2)])
+    middle = np.median(x[:, r], axis=0)
+    inverse = 1 + (x[:, r] - middle) @ slopes.T  # (n, S)
+    slopes, inverse = slopes[(inverse > 0.2).all(0)], inverse[:, (inverse > 0.2).all(0)]
+    if not len(slopes):
+        return []
+    X = np.concatenate([x[:, r], np.ones((len(x), 1))], axis=1)[None] / inverse.T[..., None]  # (S, n, 3)
+    S = len(slopes)
+    R, t = np.tile(np.eye(3), (S, K, 1, 1)), np.zeros((S, K, 3))
+    loss = np.zeros((S, K))
+    for order in (range(r + 1, K), range(r - 1, -1, -1)):
+        at = r
+        for k in order:
+            R[:, k], t[:, k] = R[:, at], t[:, at]
+            if seen[:, k].sum() >= 5:
+                R[:, k], t[:, k], loss[:, k] = resect(X, x[None, :, k], seen[None, :, k], R[:, k], t[:, k], focal, 5)
+            at = k
+    counted = seen.sum(0) >= 5
+    total = loss[:, counted].mean(1)
+    best = []
+    for s in np.argsort(total):
+        if all(np.linalg.norm(slopes[s] - slopes[b]) > 0.5 * (1 + np.linalg.norm(slopes[b])) for b in best):
+            best.append(int(s))
+        if len(best) == keep:
+            break
+    out = []
+    for s in best:
+        points, rotation, shift = X[s], R[s], t[s]
+        for _ in range(3):
+            points = _triangulated(x, seen, rotation, shift, points)
+            rotation, shift, _ = resect(points[None], x.swapaxes(0, 1), seen.T, rotation, shift, focal, 3)
+        out.append((float(total[s]), rotation, shift))
+    return out
+
+
+def resect(X: np.ndarray, x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, focal: float, rounds: int,
+           scale: float = 4.0):  # fmt: skip
+    """Many poses from known points at once: robust Gauss-Newton from nearby starts.
+
+    Args:
+        X: (B or 1, n, 3) points.  x: (B or 1, n, 2) rays.  seen: (B or 1, n) bool.
+        R, t: (B, 3, 3), (B, 3) starts.  scale: of the loss, px.
+
+    Returns:
+        R, t, and (B,) mean loss in [0, 1] (Geman-McClure).
+    """
+    x = np.nan_to_num(x)
+    for _ in range(rounds):
+        Y = X @ np.swapaxes(R, -1, -2) + t[:, None]
+        z = np.maximum(Y[..., 2], 1e-2)
+        r = (Y[..., :2] / z[..., None] - x) * focal
+        w = seen * (scale**2 / (scale**2 + np.sum(r**2, axis=-1))) ** 2
+        P = np.zeros((*z.shape, 2, 3))
+        P[..., 0, 0] = P[..., 1, 1] = focal / z
+        P[..., 0, 2], P[..., 1, 2] = -focal * Y[..., 0] / z**2, -focal * Y[..., 1] / z**2
+        J = np.concatenate([P @ -skew(Y - t[:, None]), P], axis=-1)
+        flat = J.reshape(len(J), -1, 6)
+        wJ = (w[..., None, None] * J).reshape(len(J), -1, 6)
+        H = np.swapaxes(wJ, 1, 2) @ flat
+        g = (np.swapaxes(wJ, 1, 2) @ r.reshape(len(r), -1, 1))[..., 0]
+        diagonal = np.einsum("bii->bi", H)
+        H = H + (1e-6 * diagonal + 1e-9 * diagonal.max(1, keepdims=True) + 1e-9)[..., None] * np.eye(6)
+        d = -np.linalg.solve(H, g[..., None])[..., 0]
+        d *= np.minimum(1, 0.3 / np.maximum(np.abs(d).max(1, keepdims=True), 1e-9))
+        R, t = Rotation.from_rotvec(d[:, :3]).as_matrix() @ R, t + d[:, 3:]
+    Y = X @ np.swapaxes(R, -1, -2) + t[:, None]
+    r2 = np.sum(((Y[..., :2] / np.maximum(Y[..., 2:], 1e-2) - x) * focal) ** 2, axis=-1)
+    loss = np.sum(seen * r2 / (scale**2 + r2), axis=1) / np.maximum(np.sum(seen + 0 * r2, axis=1), 1)
+    return R, t, loss
+
+
+def _triangulated(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray | None = None,
+                  px: float = 0.006) -> np.ndarray:  # fmt: skip
+    """(N, 3) points from poses: linear over all frames, reweighted by depth and residual.
+
+    Args:
+        px: scale of the residual's weight, ray units.  X: starts; from the rays alone when None.
+    """
+    x = np.nan_to_num(x)
+    rows = x[..., :, None] * R[None, :, 2:3] - R[None, :, :2]  # (N, K, 2, 3): row . X = t_xy - x t_z
+    rhs = t[None, :, :2] - x * t[None, :, 2:]
+    for sweep in range(3 if X is None else 2):
+        w = seen.astype(float)
+        if X is not None:
+            Y = np.einsum("kij,nj->nki", R, X) + t
+            z = np.maximum(Y[..., 2:], 1e-2)
+            e2 = np.sum((Y[..., :2] / z - x) ** 2, axis=-1)
+            w = w / z[..., 0] ** 2 / (1 + e2 / (px * (4.0, 2.0, 1.0)[min(sweep, 2)]) ** 2) ** 2
+        wr = w[..., None, None] * rows
+        A = wr.reshape(len(x), -1, 3).swapaxes(1, 2) @ rows.reshape(len(x), -1, 3)
+        b = (wr.reshape(len(x), -1, 3).swapaxes(1, 2) @ (-rhs).reshape(len(x), -1, 1))[..., 0]
+        # x (R2 X + tz) = R X + t  ->  (x R2 - R01) X = t01 - x tz
+        b = -b
+        damp = (1e-9 * np.trace(A, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
+        X = np.linalg.solve(A + damp, b[..., None])[..., 0]
+    return X
+
+
+def _residuals2(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray, focal: float):
+    """(N, K) squared px, 0 where not seen; huge behind the camera."""
+    Y = np.einsum("kij,nj->nki", R, X) + t
+    r2 = np.sum(((Y[..., :2] / np.maximum(Y[..., 2:], 1e-2) - np.nan_to_num(x)) * focal) ** 2, axis=-1)
+    return np.where(seen, np.where(Y[..., 2] > 1e-2, r2, 1e6), 0.0)
+
+
+def _track_cost(x, seen, R, t, X, focal, scale: float) -> np.ndarray:
+    r2 = _residuals2(x, seen, R, t, X, focal)
+    count = seen.sum(1)
+    cost = np.sum(np.where(seen, r2 / (scale**2 + r2), 0.0), axis=1) / np.maximum(count, 1)
+    return np.where(count >= 4, cost, 1.0)
+
+
+def _members(x, seen, R, t, X, focal, px: float) -> np.ndarray:
+    r2 = np.where(seen, _residuals2(x, seen, R, t, X, focal), np.nan)
+    out = np.zeros(len(x), bool)
+    enough = seen.sum(1) >= 4
+    out[enough] = np.nanmedian(r2[enough], axis=1) < px**2
+    return out
+
+
+def _grow(x, seen, R, t, focal) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Poses and members that agree, from the path of one neighbourhood; scored by explained observations."""
+    X = _triangulated(x, seen, R, t)
+    for limit in (8.0, 6.0, 4.0, 3.0, 2.5, 2.5):
+        members = _members(x, seen, R, t, X, focal, limit)
+        if members.sum() < MIN_GROUP // 2:
+            return None
+        m = np.flatnonzero(members)
+        P = X[m]
+        for _ in range(3):
+            R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 3, scale=limit)
+            P = _triangulated(x[m], seen[m], R, t, P)
+        if len(m) > 100:
+            m = m[np.linspace(0, len(m) - 1, 100).round().astype(int)]
+            P = _triangulated(x[m], seen[m], R, t)
+        R, t, _, _ = adjust(x[m], seen[m], R, t, P, focal, iterations=4)
+        X = _triangulated(x, seen, R, t)
+    members = _members(x, seen, R, t, X, focal, 2.5)
+    if members.sum() < MIN_GROUP:
+        return None
+    loss = _track_cost(x, seen, R, t, X, focal, 2.5)
+    return float(np.sum(np.clip(1 - 2 * loss, 0, 1) * seen.sum(1))), R, t, members
+
+
+def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
+    """From key frames to all frames."""
+    T = x.shape[1]
+    every = np.arange(T)
+    R = Slerp(keys, Rotation.from_matrix(R))(every).as_matrix()
+    t = np.stack([np.interp(every, keys, t[:, k]) for k in range(3)], axis=1)
+    seen = np.isfinite(x[..., 0])
+    some = seen & candidates[:, None]
+    sigma = 1.0
+    for _ in range(2):
+        m = np.flatnonzero(members)
+        if len(m) < MIN_GROUP:
+            return None
+        P = _triangulated(x[m], seen[m], R, t)
+        for _ in range(2):
+            R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 2)
+            P = _triangulated(x[m], seen[m], R, t, P)
+        if len(m) > 150:
+            m = m[np.linspace(0, len(m) - 1, 150).round().astype(int)]
+            P = _triangulated(x[m], seen[m], R, t)
+        R, t, P, sigma = adjust(x[m], seen[m], R, t, P, focal, iterations=4)
+        X = _triangulated(x, seen, R, t)
+        members = _members(x, some, R, t, X, focal, max(2.5 * sigma, 1.0)) & (X[:, 2] > 0.02)
+    if members.sum() < MIN_GROUP:
+        return None
+    # The first camera is the frame, the body's median depth the unit.
+    X = X @ R[0].T + t[0]
+    t = t - np.einsum("tij,jk,k->ti", R, R[0].T, t[0])
+    R = R @ R[0].T
+    unit = float(np.median(X[members, 2]))
+    if unit <= 0:
+        return None
+    cost = _track_cost(x, seen, R, t, X, focal, 4 * max(sigma, 0.25))
+    return Rigid(R, t / unit, X / unit, members, sigma, cost)
+
+
+def adjust(x, seen, R, t, X, focal, iterations: int = 8):
+    """Robust bundle adjustment of all poses but the first, and points (Schur complement).
+
+    Args:
+        x: (N, T, 2) rays.  seen: (N, T) bool.  R, t: (T, 3, 3), (T, 3) body to camera.  X: (N, 3).
+
+    Returns:
+        R, t, X and the noise of one coordinate, px.
+    """
+    T = len(R)
+    x, P = np.nan_to_num(x), X.copy()
+    N = len(x)
+    damping = 1e-4
+
+    def project(R, t, P):
+        Y = np.einsum("tij,nj->nti", R, P) + t
+        r = (Y[..., :2] / np.maximum(Y[..., 2:], 1e-3) - x) * focal
+        return Y, np.where(seen[..., None], r, 0.0)
+
+    Y, r = project(R, t, P)
+    sigma = 1.0
+    for step in range(iterations):
+        r2 = np.sum(r**2, axis=-1)
+        sigma = max(noise(r, seen), 0.01)
+        scale = 4.0 * sigma * (2.0 if step < 2 else 1.0)
+        g = scale**2 / (scale**2 + r2)
+        w, cost = seen * g**2, float(np.sum(seen * scale**2 * (1 - g)))
+        z = np.maximum(Y[..., 2], 1e-3)
+        J = np.zeros((N, T, 2, 3))
+        J[..., 0, 0] = J[..., 1, 1] = focal / z
+        J[..., 0, 2], J[..., 1, 2] = -focal * Y[..., 0] / z**2, -focal * Y[..., 1] / z**2
+        Jc = np.concatenate([J @ -skew(Y - t), J], axis=-1)  # (N, T, 2, 6)
+        Jx = J @ R
+        wJc = w[..., None, None] * Jc
+        Hc = np.einsum("ntia,ntib->tab", wJc, Jc, optimize=True)
+        gc = np.einsum("ntia,nti->ta", wJc, r)
+        Hx = np.einsum("nt,ntia,ntib->nab", w, Jx, Jx, optimize=True)
+        gx = np.einsum("nt,ntia,nti->na", w, Jx, r, optimize=True)
+        C = np.swapaxes(wJc, -1, -2) @ Jx  # (N, T, 6, 3)
+        for _ in range(4):
+            inv = np.linalg.inv(Hx + (damping * np.einsum("nii->ni", Hx) + 1e-9)[..., None] * np.eye(3))
+            flat = C.reshape(N, 6 * T, 3)
+            CI = flat @ inv
+            S = -np.tensordot(CI, flat, axes=([0, 2], [0, 2]))
+            for k in range(T):
+                S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += Hc[k]
+            rhs = gc.ravel() - np.einsum("npj,nj->p", CI, gx)
+            S[np.arange(6), np.arange(6)] += 1e8 * np.trace(S) / len(S)  # the first camera is the frame
+            S += (damping * np.abs(np.diag(S)) + 1e-9 * np.trace(S) / len(S)) * np.eye(len(S))
+            dc = -np.linalg.solve(S, rhs)
+            dx = -np.einsum("nab,nb->na", inv, gx + np.einsum("ntab,ta->nb", C, dc.reshape(T, 6)))
+            turn = Rotation.from_rotvec(dc.reshape(T, 6)[:, :3]).as_matrix()
+            R2, t2, P2 = turn @ R, t + dc.reshape(T, 6)[:, 3:], P + dx
+            Y2, r_2 = project(R2, t2, P2)
+            cost2 = float(np.sum(seen * scale**2 * (1 - scale**2 / (scale**2 + np.sum(r_2**2, axis=-1)))))
+            if cost2 < cost:
+                R, t, P, Y, r = R2, t2, P2, Y2, r_2
+                damping = max(damping / 10, 1e-9)
+                break
+            damping *= 10
+        else:
+            break
+    return R, t, P, sigma
