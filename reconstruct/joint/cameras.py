@@ -1,8 +1,8 @@
 """A moving camera: the rigid motions of the static scene and of the link, and the joint between them.
 
 Tracks of a rigid body give the camera's path relative to it, up to scale (groups.py). Of the two largest groups one is
-the static scene, the other the link; the joint is the motion of one path against the other, which also gives the ratio of
-their scales: linear for a hinge.
+the static scene, the other the link; the joint is the motion of one path against the other, which also gives the ratio
+of their scales: linear for a hinge.
 """
 
 from __future__ import annotations

@@ -20,7 +20,15 @@ from reconstruct.joint.polish import (
     robust_loss,
 )
 from reconstruct.joint.twist import Twist, twist_of_joint
-from reconstruct.joint.uncertainty import Spread, clusters, lasting_error, shared_error, shared_weights, spread
+from reconstruct.joint.uncertainty import (
+    Spread,
+    clusters,
+    lasting_error,
+    shared_error,
+    shared_weights,
+    spread,
+    strayed,
+)
 
 MIN_COMMON = 8
 FLEX_PX = 1.0
@@ -126,7 +134,7 @@ class View:
                          frames, lasting)  # fmt: skip
 
     def corrected(self, b: Bundle, some: np.ndarray) -> View:
-        """The camera's path as a bundle adjustment of some frames found it; between them its correction is interpolated."""
+        """The camera's path as a bundle adjustment of some frames found it, interpolated between them."""
         assert self.R is not None and self.t is not None and b.R is not None and b.t is not None
         every = np.arange(len(self.R))
         turn = Rotation.from_matrix(b.R @ np.swapaxes(self.R[some], 1, 2))
@@ -174,18 +182,15 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     sight = replace(sight, uv=sight.uv[keep], seen=sight.seen[keep], weight=sight.weight[keep])
     best = {kind: polish(replace(b, X=b.X[keep]), sight) for kind, b in best.items()}
     if still is not None:
+        best = _across_kinds(best, sight)
         best, sight = _together(best, sight, uv, still, view)
+    sight, rho, lasting = _errors(best, sight)
     lead = min(best.values(), key=lambda b: b.cost)
-    r = residuals(lead, sight)
-    # Gross outliers are not the noise.
-    r = np.where((np.sum(r**2, axis=-1) < (4 * max(lead.sigma, 0.05)) ** 2)[..., None], r, 0.0)
-    rho, lasting = shared_error(r, sight.seen, clusters(lead, sight.link)), lasting_error(r, sight.seen)
     # Errors that neighbours share are no noise: they stay for as long as the tracks do.
     alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / max(lead.sigma, 0.05) ** 2
     lasting = max(lasting, alike)
     sight = replace(sight, weight=shared_weights(rho, clusters(lead, sight.link)), lasting=lasting)
-    for kind, b in _across_kinds(best).items():
-        best[kind] = min((polish(b, sight) for b in b), key=lambda b: b.cost)
+    best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
     lead = best[_winner(type_probabilities(best, sight))]
     # Now that the motion is known, whatever follows it joins in, and the types are weighed on all of it.
     members = ids[pick]
@@ -204,6 +209,8 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     if still is not None:
         still = Still(np.setdiff1d(still.ids, members), still.X[~np.isin(still.ids, members)])
         best, few = _together(best, few, uv, still, view, rho)
+    few = _without_strays(best, few)
+    best = {kind: polish(b, few) for kind, b in best.items()}
     probability = type_probabilities(best, few)
     last = best[_winner(probability)]
     sure = spread(last, few)
@@ -216,6 +223,25 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
     return Finished(b, every, members, sure, probability, rho, lasting, view)
+
+
+def _errors(best: dict[str, Bundle], sight: Sightings) -> tuple[Sightings, float, float]:
+    """The sightings without strayed stretches; how alike neighbours' errors are, and for how long they last."""
+    for _ in range(2):
+        lead = min(best.values(), key=lambda b: b.cost)
+        r = residuals(lead, sight)
+        # Gross outliers are not the noise.
+        r = np.where((np.sum(r**2, axis=-1) < (4 * max(lead.sigma, 0.05)) ** 2)[..., None], r, 0.0)
+        rho, lasting = shared_error(r, sight.seen, clusters(lead, sight.link)), lasting_error(r, sight.seen)
+        sight = _without_strays(best, replace(sight, lasting=lasting))
+    return sight, rho, lasting
+
+
+def _without_strays(best: dict[str, Bundle], sight: Sightings) -> Sightings:
+    """Judged by the most flexible type, so that no type is helped."""
+    lead = min(best.values(), key=lambda b: b.cost)
+    lost = strayed(residuals(lead, sight), sight.seen, max(lead.sigma, 0.05), sight.lasting)
+    return replace(sight, seen=sight.seen & ~lost)
 
 
 def _spread_out(count: int, most: int) -> np.ndarray:
@@ -307,8 +333,8 @@ def followers(
     return ids[good], trial.X[good]
 
 
-def _across_kinds(best: dict[str, Bundle]) -> dict[str, list[Bundle]]:
-    """Starts of every type from what is known of the others: a slide from a hinge's chord, hinges from a bent slide."""
+def _across_kinds(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bundle]:
+    """The best of every type, started from the others too: a slide from a hinge's chord, hinges from a bent slide."""
     out: dict[str, list[Bundle]] = {k: [b] for k, b in best.items()}
     if hinge := best.get("revolute"):
         far = int(np.argmax(np.abs(hinge.q)))
@@ -323,7 +349,7 @@ def _across_kinds(best: dict[str, Bundle]) -> dict[str, list[Bundle]]:
         for e in (*basis, *-basis):
             bent = replace(slide_b.twist, curvature=0.3 / size * e)
             out.setdefault("revolute", []).append(replace(slide_b, kind="revolute", twist=bent))
-    return out
+    return {kind: min((polish(b, sight) for b in starts), key=lambda b: b.cost) for kind, starts in out.items()}
 
 
 def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, float]:

@@ -2,10 +2,10 @@
 
 A small neighbourhood of tracks is nearly a plane, and a plane's points are known once its slope is: inverse depth is
 linear in the picture. So the search is over slopes, two numbers: for each, all poses follow one after the other from
-3D to 2D (resection), and the slope under which all key frames fit is right. It does not matter whether the body is flat,
-which is where two views with an essential matrix fail, and the mirror image that a plane in weak perspective has is just
-another slope. From there the body grows: points from poses, poses from points, further tracks that fit, and a bundle
-adjustment.
+known points (resection), and the slope under which all key frames fit is right. It does not matter whether the body is
+flat, which is where two views with an essential matrix fail, and the mirror image that a plane in weak perspective has
+is just another slope. From there the body grows: points from poses, poses from points, further tracks that fit, and a
+bundle adjustment.
 """
 
 from __future__ import annotations
@@ -162,7 +162,8 @@ def _paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep:
     K = x.shape[1]
     tilt = np.tan(np.radians(TILTS_DEG))
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    slopes = np.concatenate([[[0.0, 0.0]], (tilt[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], -1)).reshape(-1, 2)])
+    slopes = (tilt[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)).reshape(-1, 2)
+    slopes = np.concatenate([[[0.0, 0.0]], slopes])
     middle = np.median(x[:, r], axis=0)
     inverse = 1 + (x[:, r] - middle) @ slopes.T  # (n, S)
     slopes, inverse = slopes[(inverse > 0.2).all(0)], inverse[:, (inverse > 0.2).all(0)]

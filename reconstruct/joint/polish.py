@@ -1,9 +1,10 @@
 """Maximum-likelihood bundle adjustment of one joint over all tracks and all frames.
 
-Unknown: the twist (see twist.py), the state in every frame, every track's point in 3D and, where they are not given, the
-focal length and the camera's pose in every frame, which tracks of the resting scene then hold. The points are
-eliminated (Schur complement, 3 x 3 blocks), so that a step costs one dense solve in the number of frames. The loss is Geman-McClure's with a scale that follows the measured noise: near to efficient for
-Gaussian noise, and stray observations drop out.
+Unknown: the twist (see twist.py), the state in every frame, every track's point in 3D and, where they are not given,
+the focal length and the camera's pose in every frame, which tracks of the resting scene then hold. The points are
+eliminated (Schur complement, 3 x 3 blocks), so that a step costs one dense solve in the number of frames. The loss is
+Geman-McClure's with a scale that follows the measured noise: near to efficient for Gaussian noise, and stray
+observations drop out.
 """
 
 from __future__ import annotations
@@ -160,10 +161,10 @@ class Normal:
         diagonal = np.einsum("nii->ni", self.Hp)
         floor = 1e-9 * diagonal.sum(1, keepdims=True) + 1e-12
         inv = np.linalg.inv(self.Hp + (damping * diagonal + floor)[..., None] * np.eye(3))
-        CI = np.einsum("pni,nij->pnj", self.C, inv)
-        flat = self.C.reshape(len(self.C), -1)
-        S = self.H - CI.reshape(len(CI), -1) @ flat.T
-        return S, self.g - np.einsum("pni,ni->p", CI, self.gp), inv
+        # inv = L L', so that the product is one of a matrix with itself, which costs half.
+        L = np.linalg.cholesky(0.5 * (inv + inv.swapaxes(1, 2)))
+        M = (self.C.swapaxes(0, 1) @ L).swapaxes(0, 1).reshape(len(self.C), -1)
+        return self.H - M @ M.T, self.g - M @ np.einsum("nij,ni->nj", L, self.gp).ravel(), inv
 
 
 def normal_equations(
@@ -212,16 +213,17 @@ def normal_equations(
     wJq = w[..., None] * Jq
     H[np.arange(A, A + T), np.arange(A, A + T)] = np.sum(wJq * Jq, axis=(0, 2))
     g[A:] = np.sum(wJq * r, axis=(0, 2))
-    H[:A, A:] = np.einsum("ntia,nti->at", Jg, wJq, optimize=True)
+    H[:A, A:] = np.sum(Jg * wJq[..., None], axis=(0, 2)).T
     H[A:, :A] = H[:A, A:].T
     wJx = w[..., None, None] * Jx
     Jx2 = Jx.reshape(N, 2 * T, 3)
     Hp = wJx.reshape(N, 2 * T, 3).swapaxes(1, 2) @ Jx2
-    gp = np.einsum("ntij,nti->nj", Jx, wr)
+    gp = (Jx2.swapaxes(1, 2) @ wr.reshape(N, 2 * T, 1))[..., 0]
     C = np.empty((A + T, N, 3))
     C[:A] = (wJg.reshape(N, 2 * T, A).swapaxes(1, 2) @ Jx2).swapaxes(0, 1)
-    C[A:] = np.einsum("nti,ntij->tnj", wJq, Jx)
-    scores = np.concatenate([np.einsum("ntia,nti->na", wJg, r), np.sum(wJq * r, axis=-1)], axis=1)
+    C[A:] = np.sum(wJq[..., None] * Jx, axis=2).swapaxes(0, 1)
+    by_lead = (wJg.reshape(N, 2 * T, A).swapaxes(1, 2) @ r.reshape(N, 2 * T, 1))[..., 0]
+    scores = np.concatenate([by_lead, np.sum(wJq * r, axis=-1)], axis=1)
     if not s.free:
         return Normal(H, g, Hp, gp, C, Z, scores, A)
     Jc = np.concatenate([in_camera @ -skew(cam - b.t), in_camera], axis=-1)  # (N, T, 2, 6)
@@ -229,15 +231,15 @@ def normal_equations(
     size = A + T + 6 * T
     full, right = np.zeros((size, size)), np.zeros(size)
     full[: A + T, : A + T], right[: A + T] = H, g
-    by_twist = np.einsum("ntip,ntia->tpa", wJc, Jg, optimize=True)
-    by_q = np.einsum("ntip,nti->tp", wJc, Jq)
-    own = np.einsum("ntip,ntir->tpr", wJc, Jc, optimize=True)
+    turned = lambda J: J.swapaxes(0, 1).reshape(T, 2 * N, -1)  # noqa: E731
+    left = turned(wJc).swapaxes(1, 2)
+    by_twist, by_q, own = left @ turned(Jg), (left @ turned(Jq))[..., 0], left @ turned(Jc)
     for k in range(T):
         rows = slice(A + T + 6 * k, A + T + 6 * k + 6)
         full[rows, rows] = own[k]
         full[rows, :A], full[:A, rows] = by_twist[k], by_twist[k].T
         full[rows, A + k], full[A + k, rows] = by_q[k], by_q[k]
-    pull = np.einsum("ntip,nti->ntp", wJc, r).reshape(N, 6 * T)
+    pull = (wJc[..., 0, :] * r[..., :1] + wJc[..., 1, :] * r[..., 1:]).reshape(N, 6 * T)
     right[A + T :] = pull.sum(0)
     coupling = (np.swapaxes(wJc, -1, -2) @ Jx).reshape(N, 6 * T, 3).swapaxes(0, 1)
     return Normal(full, right, Hp, gp, np.concatenate([C, coupling]), Z, np.concatenate([scores, pull], axis=1), A)
@@ -289,7 +291,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
                 except np.linalg.LinAlgError:
                     damping *= 10
                     continue
-                dX = -np.einsum("nij,nj->ni", inv, n.gp + np.einsum("pni,p->ni", n.C, step))
+                dX = -np.einsum("nij,nj->ni", inv, n.gp + (step @ n.C.reshape(len(step), -1)).reshape(-1, 3))
                 trial = _stepped(b, n, step, dX, row)
                 world_t, cam_t = positions(trial, s)
                 r_t = residuals(trial, s, cam_t)

@@ -85,6 +85,32 @@ def lasting_error(r: np.ndarray, seen: np.ndarray, most: int = 40) -> float:
     return float(total)
 
 
+WINDOWS = (1, 5, 11, 25)
+
+
+def strayed(r: np.ndarray, seen: np.ndarray, sigma: float, lasting: float) -> np.ndarray:
+    """(N, T) bool: stretches of tracks that have left their point, too slowly for single residuals to show it.
+
+    Sums of the residuals (N, T, 2) over windows of frames against what noise would make of them that lasts `lasting`
+    frames; the limit is the largest that noise alone would reach once in all of them.
+    """
+    N, T = seen.shape
+    limit = 2 * np.log(max(seen.sum(), 2))
+    total = np.concatenate([np.zeros((N, 1, 2)), np.cumsum(np.where(seen[..., None], r, 0.0), axis=1)], axis=1)
+    count = np.concatenate([np.zeros((N, 1)), np.cumsum(seen, axis=1)], axis=1)
+    out = np.zeros((N, T), bool)
+    for n in WINDOWS:
+        if n > T:
+            break
+        m = count[:, n:] - count[:, :-n]
+        power = np.sum((total[:, n:] - total[:, :-n]) ** 2, axis=-1)
+        power /= np.maximum(m * np.minimum(m, lasting), 1) * sigma**2
+        bad = (power > limit) & (m >= 0.5 * n)
+        for k in range(n):
+            out[:, k : T - n + 1 + k] |= bad
+    return out & seen
+
+
 def shared_weights(rho: float, cluster: np.ndarray) -> np.ndarray:
     """(N,) weights of tracks whose errors correlate by rho within a cluster: 1 / (1 + rho (m - 1)) (Kish, 1965)."""
     m = np.bincount(cluster)[cluster]
