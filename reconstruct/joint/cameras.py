@@ -2,7 +2,8 @@
 
 Tracks of a rigid body give the camera's path relative to it, up to scale (groups.py). Of the two largest groups one is
 the static scene, the other the link; the joint is the motion of one path against the other, which also gives the ratio
-of their scales: linear for a hinge.
+of their scales: linear for a hinge. Which of them rests no picture can tell: it is taken to be the one before which the
+camera's path is smoother, since the path before the other has the joint's starts and stops in it as well.
 """
 
 from __future__ import annotations
@@ -28,22 +29,35 @@ def camera_moves(uv: np.ndarray, diagonal: float) -> bool:
     return bool(np.mean(np.linalg.norm(high - low, axis=-1) < 0.004 * diagonal) < STILL_SHARE)
 
 
-def scene_and_link(one: Rigid, other: Rigid) -> tuple[Rigid, Rigid]:
-    """Which of two bodies rests: the one against which the camera's path is smoother.
+def rougher(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
+            degree: int = 4) -> bool:  # fmt: skip
+    """True if the second of two camera paths (R, t), body to camera, is the rougher one.
 
-    The link's path before the camera is the camera's own and the joint's together, with the starts and stops of both.
+    A path is six numbers a frame: where a point of the body is in the picture, the logarithm of its depth, and the
+    turn. Roughness is what polynomials in time leave of them (an arc of a circle needs no more than the fourth degree),
+    each over its noise, which differs much: the place in the picture is known far better than the camera's.
+
+    Args:
+        centre: (3,) the point, in the frame that both bodies share in the first picture.
     """
-    return (one, other) if _roughness(one) <= _roughness(other) else (other, one)
+    left, jitter = [], []
+    for R, t in (one, other):
+        T = len(R)
+        p = R @ centre + t
+        turn = Rotation.from_matrix(R[T // 2].T @ R).as_rotvec()
+        path = np.concatenate([p[:, :2] / p[:, 2:], np.log(np.maximum(p[:, 2:], 1e-6)), turn], axis=1)
+        basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, T), degree)
+        left.append(np.mean((path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]) ** 2, axis=0))
+        jitter.append(np.mean(np.diff(path, 3, axis=0) ** 2, axis=0) / 20)  # white noise grows by 1 + 9 + 9 + 1
+    noise = np.minimum(*jitter) + 1e-18
+    return bool(np.sum(left[1] / noise) > np.sum(left[0] / noise))
 
 
-def _roughness(body: Rigid, steps: int = 20) -> float:
-    """Sum of squared second differences of the camera's pose, a turn by one radian as far as the body's distance."""
-    keys = np.linspace(0, len(body.R) - 1, steps).round().astype(int)
-    R = np.swapaxes(body.R[keys], 1, 2)  # camera to body
-    centre = -np.einsum("tij,tj->ti", R, body.t[keys])
-    turn = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec()
-    # A turn in the camera's own frame, a step in the body's.
-    return float(np.sum(np.diff(turn, axis=0) ** 2) + np.sum(np.diff(centre, 2, axis=0) ** 2))
+def before_the_link(twist: Twist, q: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The camera's path (T, 3, 3), (T, 3) with the link for the world, from that with the scene for it."""
+    turn, shift = twist.pose(q)
+    moved = twist.anchor + shift - np.einsum("tij,j->ti", turn, twist.anchor)
+    return R @ turn, np.einsum("tij,tj->ti", R, moved) + t
 
 
 def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:

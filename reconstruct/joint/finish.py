@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from reconstruct.joint.bundle import Observations, State, transport
+from reconstruct.joint.cameras import before_the_link, rougher
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities
 from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
@@ -35,8 +36,12 @@ FLEX_PX = 1.0
 """How far real parts flex and tracks drift together, working px, once errors are seen to be shared at all."""
 MOST_FRAMES, MOST_TRACKS = 220, 400
 """Bounds of one bundle adjustment; further frames get their state afterwards, further tracks their point."""
-COARSE_FRAMES, FREE_FRAMES, MOST_STILL = 34, 100, 200
+FREE_FRAMES, MOST_STILL = 100, 200
 """The same where the camera's poses are unknown: six more numbers a frame make a step dear."""
+COARSE_FRAMES = 40
+"""Frames of the first round, which finds every type's best joint."""
+NO_SCREW = 1e-3
+"""A thread less probable than this in the first round is not looked at again: the hinge is its special case."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +52,6 @@ class Finished:
         bundle: the most probable type's, over all frames, mean depth of the link 1.
         sight: its observations, (n, T).  members: (n,) indices into the tracks given.
         spread: its uncertainty.  probability: of each type.
-        rho: correlation of neighbouring tracks' errors.
-        lasting: frames for which a track's error lasts.
         view: focal length and camera, whose path is fitted together with the joint where it moves.
     """
 
@@ -57,8 +60,6 @@ class Finished:
     members: np.ndarray
     spread: Spread
     probability: dict[str, float]
-    rho: float
-    lasting: float
     view: View
 
 
@@ -162,10 +163,8 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
             together with the joint, whose uncertainty then holds the camera's.
     """
     T = uv.shape[1]
-    some = _spread_out(T, MOST_FRAMES if still is None else COARSE_FRAMES)
-    pick = np.arange(len(ids))
-    if len(ids) > MOST_TRACKS:
-        pick = np.linspace(0, len(ids) - 1, MOST_TRACKS).round().astype(int)
+    some = _spread_out(T, COARSE_FRAMES)
+    pick = _spread_out(len(ids), MOST_TRACKS)
     # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
     sight = view.sightings(uv[ids[pick]], some, lasting=100.0)
     best: dict[str, Bundle] = {}
@@ -178,112 +177,120 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     keep = np.logical_and.reduce(sane)
     if keep.sum() < max(MIN_COMMON, 0.8 * max(s.sum() for s in sane)):
         keep = sane[int(np.argmin([b.cost for b in best.values()]))]
-    pick = pick[keep]
+    members = ids[pick[keep]]
     sight = replace(sight, uv=sight.uv[keep], seen=sight.seen[keep], weight=sight.weight[keep])
-    best = {kind: polish(replace(b, X=b.X[keep]), sight) for kind, b in best.items()}
-    if still is not None:
-        best = _across_kinds(best, sight)
-        best, sight = _together(best, sight, uv, still, view)
-    sight, rho, lasting = _errors(best, sight)
-    lead = min(best.values(), key=lambda b: b.cost)
-    # Errors that neighbours share are no noise: they stay for as long as the tracks do.
-    alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / max(lead.sigma, 0.05) ** 2
-    lasting = max(lasting, alike)
-    sight = replace(sight, weight=shared_weights(rho, clusters(lead, sight.link)), lasting=lasting)
+    best = {kind: replace(b, X=b.X[keep]) for kind, b in best.items()}
+    if still is None:
+        best = {kind: polish(b, sight) for kind, b in best.items()}
+    else:
+        best, sight = _together(_across_kinds(best, sight), sight, uv, still, view)
+    sight = _errors(best, sight)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
-    lead = best[_winner(type_probabilities(best, sight))]
-    # Now that the motion is known, whatever follows it joins in, and the types are weighed on all of it.
-    members = ids[pick]
-    if still is not None:
-        best, some, view = _on_frames(best, sight, uv, members, some, view)
-        sight, lead = replace(sight, link=None, free=False, frames=some), best[lead.kind]
-    more, X = followers(lead, uv, np.setdiff1d(np.arange(len(uv)), members), view, sight)
+    probability = type_probabilities(best, sight)
+    if probability.get("screw", 1.0) < NO_SCREW:
+        del best["screw"]
+
+    # Now that the motion is known, on all frames whatever follows it joins in, and the types are weighed on all of it.
+    kind = _winner(probability)
+    best, members, still, view = _on_all_frames(best, kind, sight, uv, members, still, view)
+    some = _spread_out(T, MOST_FRAMES if still is None else FREE_FRAMES)
+    best = {k: replace(b, q=b.q[some] - b.q[some[0]]) for k, b in best.items()}
+    lead = best[kind]
+    like = view.sightings(uv[members], some)
+    more, X = followers(lead, uv, np.setdiff1d(np.arange(len(uv)), members), view, like)
     members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
-    weight = shared_weights(rho, clusters(replace(lead, X=X)))
-    sight = replace(view.sightings(uv[members], some, lasting), weight=weight)
+    sight = view.sightings(uv[members], some, lasting=100.0)
     bound = _spread_out(len(members), MOST_TRACKS)
-    few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=weight[bound])
-    for kind, b in best.items():
-        start = replace(b, X=X[bound])
-        best[kind] = polish(start if b is lead else place_points(start, few), few, iterations=30)
-    if still is not None:
-        still = Still(np.setdiff1d(still.ids, members), still.X[~np.isin(still.ids, members)])
-        best, few = _together(best, few, uv, still, view, rho)
-    few = _without_strays(best, few)
-    best = {kind: polish(b, few) for kind, b in best.items()}
+    few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=sight.weight[bound])
+    best = {k: place_points(replace(b, X=X[bound]), few) for k, b in best.items()}
+    if still is None:
+        best = {k: polish(b, few, iterations=30) for k, b in best.items()}
+    else:
+        rest = Still(np.setdiff1d(still.ids, members), still.X[~np.isin(still.ids, members)])
+        best, few = _together(best, few, uv, rest, view)
+    few = _errors(best, few)
+    best = {k: polish(b, few) for k, b in best.items()}
     probability = type_probabilities(best, few)
     last = best[_winner(probability)]
     sure = spread(last, few)
+    weight = few.weight
     if few.link is not None:
         view = view.corrected(last, some)
-        last = replace(last, X=last.X[few.link], R=None, t=None)
+        last, weight = replace(last, X=last.X[few.link], R=None, t=None), weight[few.link]
+    sight = replace(sight, weight=np.interp(np.arange(len(members)), bound, weight), lasting=few.lasting)
+    sight.seen[bound] = few.seen[: len(bound)]
     b = place_points(replace(last, X=X), sight, rounds=4) if len(bound) < len(members) else last
-    every = replace(view.sightings(uv[members], np.arange(T), lasting), weight=sight.weight)
+    every = replace(view.sightings(uv[members], np.arange(T), few.lasting), weight=sight.weight)
     if len(some) < T:
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
-    return Finished(b, every, members, sure, probability, rho, lasting, view)
+    return Finished(b, every, members, sure, probability, view)
 
 
-def _errors(best: dict[str, Bundle], sight: Sightings) -> tuple[Sightings, float, float]:
-    """The sightings without strayed stretches; how alike neighbours' errors are, and for how long they last."""
-    for _ in range(2):
-        lead = min(best.values(), key=lambda b: b.cost)
-        r = residuals(lead, sight)
-        # Gross outliers are not the noise.
-        r = np.where((np.sum(r**2, axis=-1) < (4 * max(lead.sigma, 0.05)) ** 2)[..., None], r, 0.0)
-        rho, lasting = shared_error(r, sight.seen, clusters(lead, sight.link)), lasting_error(r, sight.seen)
-        sight = _without_strays(best, replace(sight, lasting=lasting))
-    return sight, rho, lasting
+def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
+    """The sightings with what their errors are like: strayed stretches gone, how long errors last, and weights.
 
-
-def _without_strays(best: dict[str, Bundle], sight: Sightings) -> Sightings:
-    """Judged by the most flexible type, so that no type is helped."""
+    Judged by the most flexible type, so that no type is helped.
+    """
     lead = min(best.values(), key=lambda b: b.cost)
-    lost = strayed(residuals(lead, sight), sight.seen, max(lead.sigma, 0.05), sight.lasting)
-    return replace(sight, seen=sight.seen & ~lost)
+    sigma = max(lead.sigma, 0.05)
+    cluster = clusters(lead, sight.link)
+    e = residuals(lead, sight)
+    rho = 0.0
+    for _ in range(2):
+        # Gross outliers are not the noise.
+        r = np.where((sight.seen & (np.sum(e**2, axis=-1) < (4 * sigma) ** 2))[..., None], e, 0.0)
+        rho, lasting = shared_error(r, sight.seen, cluster), lasting_error(r, sight.seen)
+        lost = strayed(e, sight.seen, sigma, lasting)
+        sight = replace(sight, seen=sight.seen & ~lost, lasting=lasting)
+    # Errors that neighbours share are no noise: they stay for as long as the tracks do.
+    alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2
+    return replace(sight, weight=shared_weights(rho, cluster), lasting=max(sight.lasting, alike))
 
 
 def _spread_out(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: Still, view: View, rho: float = 0.0):
+def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: Still, view: View):
     """Joint and camera in one bundle adjustment: the bundles with the scene's points and poses, and its sightings."""
     pick = _spread_out(len(still.ids), MOST_STILL)
     scene = view.sightings(uv[still.ids[pick]], sight.frames)
-    X = still.X[pick]
     both = replace(
         sight,
         uv=np.concatenate([sight.uv, scene.uv]),
         seen=np.concatenate([sight.seen, scene.seen]),
         weight=np.concatenate([sight.weight, scene.weight]),
-        link=np.arange(len(sight.uv) + len(X)) < len(sight.uv),
+        link=np.arange(len(sight.uv) + len(pick)) < len(sight.uv),
         free=True,
-        R=scene.R,
-        t=scene.t,
     )
-    out = {}
-    for kind, b in best.items():
-        one = replace(b, X=np.concatenate([b.X, X]), R=scene.R, t=scene.t)
-        if rho:
-            both = replace(both, weight=shared_weights(rho, clusters(one, both.link)))
-        out[kind] = polish(one, both)
-    return out, both
+    start = {k: replace(b, X=np.concatenate([b.X, still.X[pick]]), R=scene.R, t=scene.t) for k, b in best.items()}
+    return {k: polish(b, both) for k, b in start.items()}, both
 
 
-def _on_frames(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, members: np.ndarray, some: np.ndarray,
-               view: View):  # fmt: skip
-    """The link alone again, on as many frames as the last bundle adjustment takes, before the camera found so far."""
-    lead = min(best.values(), key=lambda b: b.cost)
-    view = view.corrected(lead, some)
-    more = _spread_out(uv.shape[1], FREE_FRAMES)
-    every = view.sightings(uv[members], np.arange(uv.shape[1]))
-    out = {}
-    for kind, b in best.items():
-        b = states_of_all_frames(replace(b, X=b.X[sight.link], R=None, t=None), every, some)
-        out[kind] = replace(b, q=b.q[more] - b.q[more[0]])
-    return out, more, view
+def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, uv: np.ndarray, members: np.ndarray,
+                   still: Still | None, view: View):  # fmt: skip
+    """From the first round's frames to all, before the camera found so far: the link alone, its tracks, scene and view.
+
+    Before a moving camera link and scene change places where the path before the link is the smoother one. That is the
+    same joint run backwards.
+    """
+    every = view if still is None else view.corrected(best[kind], sight.frames)
+    link = np.ones(len(sight.uv), bool) if sight.link is None else sight.link
+    seen = every.sightings(uv[members], np.arange(uv.shape[1]))
+    out = {
+        k: states_of_all_frames(replace(b, X=b.X[link], R=None, t=None), seen, sight.frames) for k, b in best.items()
+    }
+    if still is None or every.R is None or every.t is None:
+        return out, members, still, every
+    b = best[kind]
+    if b.R is None or b.t is None or rougher((b.R, b.t), before_the_link(b.twist, b.q, b.R, b.t), b.twist.anchor):
+        return out, members, still, every
+    path = before_the_link(out[kind].twist, out[kind].q, every.R, every.t)
+    others = still.ids[_spread_out(len(still.ids), MOST_STILL)]
+    scene = Still(members, out[kind].X)
+    out = {k: replace(b, q=-b.q, X=best[k].X[~link]) for k, b in out.items()}
+    return out, others, scene, replace(every, R=path[0], t=path[1])
 
 
 def _winner(probability: dict[str, float]) -> str:

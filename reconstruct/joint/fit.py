@@ -9,7 +9,7 @@ import numpy as np
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
-from reconstruct.joint.cameras import camera_moves, joints_between, scene_and_link
+from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import bridged, free_motion
 from reconstruct.joint.finish import Finished, Still, View, finish
 from reconstruct.joint.groups import two_bodies
@@ -201,14 +201,14 @@ def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, 
     bodies = two_bodies(uv, view.focal, seed)
     if bodies is None:
         return None
-    static, link = scene_and_link(*bodies)
+    static, link = bodies
     starts = joints_between(static, link)
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])
     done = finish(starts, uv, np.flatnonzero(link.members), view, still)
     if reason := _why_not_believed(done):
         return JointFit("refused", reason, tracks=tracks, inliers=len(done.members))
-    note = f"; the camera moves: its path is fitted to {int(static.members.sum())} static tracks"
+    note = "; the camera moves: its path is fitted together with the joint"
     return _result(video, done, full_focal, tracks, note, KNOWN_STD if view.focal_std == 0 else None)
 
 

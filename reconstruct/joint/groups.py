@@ -26,6 +26,11 @@ PATCH = (14, 30)
 TILTS_DEG = (25.0, 45.0, 60.0, 70.0, 78.0)
 GROWN = 6
 """Neighbourhoods that are grown to bodies."""
+FINISHED = 3
+"""Bodies that are looked at in all frames."""
+SLOW, SLOW_WINDOWS = 4.0, 5
+"""A track belongs to a body if its mean residuals over fifths of the video have no more than so many times the power
+that noise would leave. A second body that turns slowly against the first can be fitted to a pixel, not to its mean."""
 
 
 @dataclass(frozen=True)
@@ -91,29 +96,25 @@ def rigid_group(uv: np.ndarray, focal: float, candidates: np.ndarray, seed: int 
         long = np.flatnonzero(seen.sum(1) >= 6)
     if len(long) < MIN_GROUP:
         return None
-    starts: list[tuple[float, np.ndarray, np.ndarray, int]] = []
+    starts: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
     spread = _farthest(xk[long], min(SEEDS, len(long)), rng)
     for n, seed_track in enumerate(long[spread]):
         patch, r = _neighbours(xk, seen, seed_track, PATCH[n % len(PATCH)])
         if len(patch) < 8:
             continue
-        for cost, R, t in _paths_of_patch(xk[patch], seen[patch], r, focal):
+        for R, t in _paths_of_patch(xk[patch], seen[patch], r, focal):
             X = _triangulated(xk, seen, R, t)
             loss = _track_cost(xk, seen, R, t, X, focal, 6.0)
-            worth = float(np.sum((1 - loss) * seen.sum(1)))
-            starts.append((worth, R, t, cost))
-    if not starts:
-        return None
+            starts.append((float(np.sum((1 - loss) * seen.sum(1))), R, t, patch))
     starts.sort(key=lambda s: -s[0])
-    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
-    for _, R, t, _ in starts[:GROWN]:
-        grown = _grow(xk, seen, R, t, focal)
-        if grown is not None and (best is None or grown[0] > best[0]):
-            best = grown
-    if best is None:
-        return None
-    _, R, t, members = best
-    return _whole(x, candidates, keys, R, t, members, focal)
+    grown = [g for g in (_grow(xk, seen, R, t, patch, focal) for _, R, t, patch in starts[:GROWN]) if g is not None]
+    grown.sort(key=lambda g: -g[0])
+    best: Rigid | None = None
+    for _, R, t, members in grown[:FINISHED]:
+        body = _whole(x, candidates, keys, R, t, members, focal)
+        if body is not None and (best is None or body.members.sum() > best.members.sum()):
+            best = body
+    return best
 
 
 def regrown(uv: np.ndarray, focal: float, body: Rigid, candidates: np.ndarray) -> Rigid:
@@ -150,7 +151,7 @@ def _neighbours(xk: np.ndarray, seen: np.ndarray, track: int, count: int) -> tup
 
 
 def _paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep: int = 2):
-    """The camera's path about a nearly flat patch: the best slopes' (cost, R, t), the patch's depth about 1.
+    """The camera's path about a nearly flat patch: the best slopes' (R, t), the patch's depth about 1.
 
     Args:
         x: (n, K, 2) rays.  seen: (n, K) bool.  r: key frame in which the slope is written.
@@ -194,7 +195,7 @@ def _paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep:
         for _ in range(3):
             points = _triangulated(x, seen, rotation, shift, points)
             rotation, shift, _ = resect(points[None], x.swapaxes(0, 1), seen.T, rotation, shift, focal, 3)
-        out.append((float(total[s]), rotation, shift))
+        out.append((rotation, shift))
     return out
 
 
@@ -283,27 +284,44 @@ def _members(x, seen, R, t, X, focal, px: float) -> np.ndarray:
     return out
 
 
-def _grow(x, seen, R, t, focal) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Poses and members that agree, from the path of one neighbourhood; scored by explained observations."""
-    X = _triangulated(x, seen, R, t)
-    for limit in (8.0, 6.0, 4.0, 3.0, 2.5, 2.5):
+def _slow(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray, focal: float,
+          sigma: float) -> np.ndarray:  # fmt: skip
+    """(N,) median power of the residuals' means over stretches of the video, 1 for white noise."""
+    Y = np.einsum("kij,nj->nki", R, X) + t
+    r = (Y[..., :2] / np.maximum(Y[..., 2:], 1e-2) - np.nan_to_num(x)) * focal
+    use = seen & (np.sum(r**2, axis=-1) < (6 * sigma) ** 2)
+    r = np.where(use[..., None], r, 0.0)
+    cuts = np.linspace(0, x.shape[1], SLOW_WINDOWS + 1).round().astype(int)[:-1]
+    total, count = np.add.reduceat(r, cuts, axis=1), np.add.reduceat(use, cuts, axis=1)
+    power = np.sum(total**2, axis=-1) / (np.maximum(count, 1) * sigma**2) / (2 * np.log(2))
+    enough = count >= 0.3 * np.diff([*cuts, x.shape[1]])
+    out = np.full(len(x), np.inf)
+    some = enough.any(1)
+    out[some] = np.nanmedian(np.where(enough, power, np.nan)[some], axis=1)
+    return out
+
+
+def _grow(x, seen, R, t, patch, focal) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Poses and members that agree, grown from one neighbourhood outwards; scored by explained observations."""
+    members = np.zeros(len(x), bool)
+    members[patch] = True
+    sigma = 1.0
+    for k in range(7):
+        m = np.flatnonzero(members)
+        if len(m) > 100:
+            m = m[np.linspace(0, len(m) - 1, 100).round().astype(int)]
+        P = _triangulated(x[m], seen[m], R, t)
+        for _ in range(2):
+            R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 3)
+            P = _triangulated(x[m], seen[m], R, t, P)
+        R, t, _, sigma = adjust(x[m], seen[m], R, t, P, focal, iterations=4)
+        X = _triangulated(x, seen, R, t)
+        # What a small neighbourhood leaves open is small near it: the body grows as its path becomes known.
+        limit = max(2.5 * sigma, (3.0, 2.5, 2.0)[min(k, 2)])
         members = _members(x, seen, R, t, X, focal, limit)
         if members.sum() < MIN_GROUP // 2:
             return None
-        m = np.flatnonzero(members)
-        P = X[m]
-        for _ in range(3):
-            R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 3, scale=limit)
-            P = _triangulated(x[m], seen[m], R, t, P)
-        if len(m) > 100:
-            m = m[np.linspace(0, len(m) - 1, 100).round().astype(int)]
-            P = _triangulated(x[m], seen[m], R, t)
-        R, t, _, _ = adjust(x[m], seen[m], R, t, P, focal, iterations=4)
-        X = _triangulated(x, seen, R, t)
-    members = _members(x, seen, R, t, X, focal, 2.5)
-    if members.sum() < MIN_GROUP:
-        return None
-    loss = _track_cost(x, seen, R, t, X, focal, 2.5)
+    loss = _track_cost(x, seen, R, t, X, focal, 4 * sigma)
     return float(np.sum(np.clip(1 - 2 * loss, 0, 1) * seen.sum(1))), R, t, members
 
 
@@ -316,22 +334,24 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     seen = np.isfinite(x[..., 0])
     some = seen & candidates[:, None]
     sigma = 1.0
-    for _ in range(2):
+    for k in range(6):
         m = np.flatnonzero(members)
         if len(m) < MIN_GROUP:
             return None
-        P = _triangulated(x[m], seen[m], R, t)
-        for _ in range(2):
-            R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 2)
-            P = _triangulated(x[m], seen[m], R, t, P)
         if len(m) > 150:
             m = m[np.linspace(0, len(m) - 1, 150).round().astype(int)]
-            P = _triangulated(x[m], seen[m], R, t)
-        R, t, P, sigma = adjust(x[m], seen[m], R, t, P, focal, iterations=4)
+        P = _triangulated(x[m], seen[m], R, t)
+        if k == 0:
+            for _ in range(2):
+                R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 2)
+                P = _triangulated(x[m], seen[m], R, t, P)
+        R, t, P, sigma = adjust(x[m], seen[m], R, t, P, focal, iterations=8)
         X = _triangulated(x, seen, R, t)
-        members = _members(x, some, R, t, X, focal, max(2.5 * sigma, 1.0)) & (X[:, 2] > 0.02)
-    if members.sum() < MIN_GROUP:
-        return None
+        fits = _members(x, some, R, t, X, focal, max(2.5 * sigma, 1.0)) & (X[:, 2] > 0.02)
+        slow = _slow(x, some, R, t, X, focal, max(sigma, 0.1))
+        # Real errors last: then the better half sets the measure. Of two bodies in one it is nearer to one of them.
+        usual = max(float(np.median(slow[fits])) if fits.any() else 1.0, 1.0)
+        members = fits & (slow < (1.0, 1.0, SLOW)[min(k, 2)] * usual)
     # The first camera is the frame, the body's median depth the unit.
     X = X @ R[0].T + t[0]
     t = t - np.einsum("tij,jk,k->ti", R, R[0].T, t[0])
@@ -355,7 +375,7 @@ def adjust(x, seen, R, t, X, focal, iterations: int = 8):
     T = len(R)
     x, P = np.nan_to_num(x), X.copy()
     N = len(x)
-    damping = 1e-4
+    damping = 1e-7  # the weak direction (a flatter body that turns more) is this weak
 
     def project(R, t, P):
         Y = np.einsum("tij,nj->nti", R, P) + t
@@ -390,8 +410,9 @@ def adjust(x, seen, R, t, X, focal, iterations: int = 8):
             for k in range(T):
                 S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += Hc[k]
             rhs = gc.ravel() - np.einsum("npj,nj->p", CI, gx)
-            S[np.arange(6), np.arange(6)] += 1e8 * np.trace(S) / len(S)  # the first camera is the frame
-            S += (damping * np.abs(np.diag(S)) + 1e-9 * np.trace(S) / len(S)) * np.eye(len(S))
+            typical = np.trace(S) / len(S)
+            S[:6], S[:, :6], rhs[:6] = 0.0, 0.0, 0.0  # the first camera is the frame
+            S += np.diag(damping * np.abs(np.diag(S)) + 1e-12 * typical + typical * (np.arange(len(S)) < 6))
             dc = -np.linalg.solve(S, rhs)
             dx = -np.einsum("nab,nb->na", inv, gx + np.einsum("ntab,ta->nb", C, dc.reshape(T, 6)))
             turn = Rotation.from_rotvec(dc.reshape(T, 6)[:, :3]).as_matrix()
