@@ -83,6 +83,22 @@ def single(asset: Asset, steps: int) -> dict[str, Callable[[], np.ndarray]]:
     return {"raw mj_step": raw, "environment": lambda: play(plain), "gym.make": lambda: play(made)}
 
 
+def alone(env: gymnasium.Env, loops: int = 300, steps: int = 50) -> float:
+    """Least time of a step with the physics left out, s: the Python around it, its caches warm."""
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    for _ in range(10):
+        env.step(action)
+    env.unwrapped.task.rows.step = lambda ids, count=1: None
+    best = np.inf
+    for _ in range(loops):
+        begin = time.perf_counter()
+        for _ in range(steps):
+            env.step(action)
+        best = min(best, (time.perf_counter() - begin) / steps)
+    return best
+
+
 def many(asset: Asset, n: int, steps: int, with_sync: bool) -> dict[str, Callable[[], np.ndarray]]:
     """The same for n simulations."""
     start, actions, controls = recorded(asset, steps)
@@ -195,6 +211,9 @@ def main() -> None:
         limit = int(0.6 * asset.demo["duration"] * ArticulationEnv.metadata["render_fps"])
         steps = min(arguments.steps, limit)
         report_single(interleaved(single(asset, steps), arguments.rounds), steps)
+        print("\nPython alone, physics left out: "
+              + ", ".join(f"{name} {1e6 * alone(env):.1f} us"
+                          for name, env in (("environment", ArticulationEnv(asset)), ("gym.make", wrapped(asset)))))
         print("\n| simulations | what | steps a second | x bare batch, clock (processor) | x SyncVectorEnv |")
         print("| --- | --- | --- | --- | --- |")
         steps, rates = min(arguments.batch_steps, limit), {}

@@ -37,7 +37,7 @@ class Config:
     randomize: bool = True
     hold: int = 5
     evaluate_every: int = 0
-    evaluate_episodes: int = 64
+    evaluate_episodes: int = 100
     enough: float = 1.0
     seed: int = 0
     algorithm: Mapping[str, Any] = field(default_factory=dict)

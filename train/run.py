@@ -43,7 +43,7 @@ FREE = ("steps", "checkpoint_every", "evaluate_every", "evaluate_episodes", "eno
 COLUMNS = ("steps", "episodes", "success", "return", "progress", "evaluated", "seconds", "processor")
 EVALUATED = COLUMNS.index("evaluated")
 WINDOW = 100  # episodes that a row of the curve averages over
-WORTHWHILE = 0.8  # success in training, with exploration, from which on the policy is evaluated without
+WORTHWHILE = 0.9  # success in training, with exploration, from which on the policy is evaluated without
 EVALUATION_SEED = 500_000  # of an evaluation's first episode: not the training's, nor those of `taa evaluate`
 CHUNK = 2048  # environment steps between rows of SAC's curve; PPO has one a rollout
 
