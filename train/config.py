@@ -25,6 +25,7 @@ class Config:
         hold: environment steps for which the policy's action is held.
         evaluate_every, evaluate_episodes, enough: environment steps between evaluations without exploration (0: none),
             episodes of one, and the success at which training ends.
+        anneal_to, anneal_steps: PPO's log standard deviation is held below a line to this value at so many steps.
         algorithm, policy: arguments of the Stable-Baselines3 class and of its policy.
     """
 
@@ -39,6 +40,8 @@ class Config:
     evaluate_every: int = 0
     evaluate_episodes: int = 100
     enough: float = 1.0
+    anneal_to: float | None = None
+    anneal_steps: int = 100_000
     seed: int = 0
     algorithm: Mapping[str, Any] = field(default_factory=dict)
     policy: Mapping[str, Any] = field(default_factory=dict)
@@ -65,13 +68,14 @@ def load_config(algo: str = "ppo", file: Path | None = None, **changes: Any) -> 
         reason = " ".join(str(error).split())[:120]
         raise TaaEnvsError(f"{file} does not hold training settings ({reason}); copy one of train/configs") from None
     for name, least, most in (("envs", 1, 65_536), ("steps", 1, 10**12), ("checkpoint_every", 1, 10**12),
-                              ("evaluate_every", 0, 10**12), ("evaluate_episodes", 1, 10**6)):  # fmt: skip
+                              ("evaluate_every", 0, 10**12), ("evaluate_episodes", 1, 10**6),
+                              ("anneal_steps", 1, 10**12)):  # fmt: skip
         value = getattr(made, name)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
             raise TaaEnvsError(f"{name} must be a whole number from {least} to {most}, is {str(value)[:40]}; "
                                f"mend {file}")
     for name, kinds in (("reward", (str, dict)), ("action", (str,)), ("randomize", (bool, list, dict)),
-                        ("seed", (int,)), ("enough", (int, float)),
+                        ("seed", (int,)), ("enough", (int, float)), ("anneal_to", (int, float, type(None))),
                         ("algorithm", (dict,)), ("policy", (dict,))):  # fmt: skip
         if not isinstance(getattr(made, name), kinds):
             words = " or ".join(k.__name__ for k in kinds)

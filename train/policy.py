@@ -91,13 +91,15 @@ class Policy:
         return self.network.predict(self.normal(observation), deterministic=True)[0]
 
 
-def save_policy(file: Path, policy: BasePolicy, normal: Normal, config: Config, asset_id: str) -> None:
-    """Write a trained policy."""
+def save_policy(file: Path, policy: BasePolicy, normal: Normal, config: Config, asset_id: str,
+                weights: dict[str, torch.Tensor] | None = None) -> None:
+    """Write a trained policy; weights: in place of its present ones."""
     save_torch(file, {"format": FORMAT, "algo": config.algo, "asset": asset_id, "action": config.action,
                       "hold": config.hold, "mean": torch.from_numpy(normal.mean), "std": torch.from_numpy(normal.std),
                       "use_sde": bool(config.algorithm.get("use_sde", False)), "policy": dict(config.policy),
                       "observation_size": policy.observation_space.shape[0],
-                      "action_size": policy.action_space.shape[0], "weights": policy.state_dict()})
+                      "action_size": policy.action_space.shape[0],
+                      "weights": policy.state_dict() if weights is None else weights})
 
 
 def load_policy(file: str | os.PathLike) -> tuple[Policy, dict[str, Any]]:

@@ -5,7 +5,7 @@
     RUN/config.json      settings, the asset's id and digest
     RUN/checkpoint.pt    all that training goes on from: weights, optimisers, generators, every simulation's state
     RUN/curve.csv        one row an iteration
-    RUN/policy.pt        the policy so far, for `taa evaluate`
+    RUN/policy.pt        the policy that did best in an evaluation, or the last one where none is made
 
 A run that was killed goes on from its last checkpoint as if nothing had happened: the curve is the same, row by row.
 """
@@ -43,7 +43,6 @@ FREE = ("steps", "checkpoint_every", "evaluate_every", "evaluate_episodes", "eno
 COLUMNS = ("steps", "episodes", "success", "return", "progress", "evaluated", "seconds", "processor")
 EVALUATED = COLUMNS.index("evaluated")
 WINDOW = 100  # episodes that a row of the curve averages over
-WORTHWHILE = 0.9  # success in training, with exploration, from which on the policy is evaluated without
 EVALUATION_SEED = 500_000  # of an evaluation's first episode: not the training's, nor those of `taa evaluate`
 CHUNK = 2048  # environment steps between rows of SAC's curve; PPO has one a rollout
 
@@ -89,8 +88,8 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     Args:
         asset: what to train on.
         config: settings.  ``steps`` may be larger than the run's was: it then goes on. With ``evaluate_every`` the
-            policy is evaluated without exploration as soon as it does well, and training ends where it does well
-            ``enough``.
+            policy is evaluated without exploration now and then, before the first step too; the best one is kept, and
+            training ends where one does well ``enough``.
         folder: the run's, made if missing.
         minutes: stop after so many by the clock, those before a kill counted in; the run can go on later.
         progress: called after every iteration with the share done and the curve's row.
@@ -126,27 +125,27 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
             model.policy.action_net.weight.zero_()
     episodes, rows = _Episodes(-(-batch.max_episode_steps // config.hold)), []
     chunk = config.envs * model.n_steps if config.algo == "ppo" else max(CHUNK // config.hold, config.envs)
-    resumed, seconds, used = 0, 0.0, 0.0
+    resumed, seconds, used, best = 0, 0.0, 0.0, None
     if content is not None:
-        rows = _restore(model, env, episodes, content)
+        rows, best = _restore(model, env, episodes, content), content["best"]
         resumed, (seconds, used) = model.num_timesteps * config.hold, rows[-1][-2:] if rows else (0.0, 0.0)
-        _write_results(folder, model, normal, config, asset, rows)  # the kill may have come before they were written
+        # The kill may have come before they were written.
+        _write_results(folder, model, best, normal, config, asset, rows)
     begin, begin_used, saved, made = time.monotonic() - seconds, time.process_time() - used, resumed, resumed
-    trial: BatchedArticulationEnv | None = None
+    judge = _Judge(asset, config, normal)
     over = made >= config.steps or (bool(rows) and rows[-1][EVALUATED] >= config.enough)
     while not over:
-        # The first call resets the environments, the others go on.
-        model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
+        if rows or not config.evaluate_every:  # else the untrained policy is evaluated first: PPO's is the replay
+            _quieten(model, config, made)
+            # The first call resets the environments, the others go on.
+            model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
         made = model.num_timesteps * config.hold  # Stable-Baselines3 counts decisions
-        means = episodes.means()
         evaluated = float("nan")
-        if config.evaluate_every and means[0] >= WORTHWHILE and made - _evaluated_at(rows) >= config.evaluate_every:
-            if trial is None:
-                trial = make_env(asset, config.evaluate_episodes, action=config.action, randomize=config.randomize,
-                                 hold=config.hold)
-            evaluated = float(run_episodes(asset, Policy(model.policy, normal, config.hold), config.evaluate_episodes,
-                                           seed=EVALUATION_SEED, env=trial)["success"].mean())
-        rows.append([made, episodes.count, *means, evaluated, time.monotonic() - begin,
+        if config.evaluate_every and made - _evaluated_at(rows) >= config.evaluate_every:
+            evaluated = judge.success(model)
+            if best is None or evaluated >= best["evaluated"]:
+                best = {"evaluated": evaluated, "weights": {k: v.clone() for k, v in model.policy.state_dict().items()}}
+        rows.append([made, episodes.count, *episodes.means(), evaluated, time.monotonic() - begin,
                      time.process_time() - begin_used])
         for name, value in zip(COLUMNS[1:], rows[-1][1:], strict=True):
             model.logger.record(f"taa/{name}", value)
@@ -156,16 +155,43 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         over = (made >= config.steps or evaluated >= config.enough
                 or (minutes is not None and time.monotonic() - begin >= 60 * minutes))
         if made - saved >= config.checkpoint_every or over:
-            save_torch(checkpoint, _checkpoint(model, env, normal, episodes, rows))
-            _write_results(folder, model, normal, config, asset, rows)
+            save_torch(checkpoint, {**_checkpoint(model, env, normal, episodes, rows), "best": best})
+            _write_results(folder, model, best, normal, config, asset, rows)
             saved = made
     env.close()
-    if trial is not None:
-        trial.close()
+    judge.close()
     last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
     return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
             "steps": made,
             **{k: None if np.isnan(last[k]) else last[k] for k in COLUMNS[2:] if k in last}}
+
+
+class _Judge:
+    """Evaluates policies without exploration, in episodes of its own and always the same."""
+
+    def __init__(self, asset: Asset, config: Config, normal: Normal) -> None:
+        self._asset, self._config, self._normal = asset, config, normal
+        self._env: BatchedArticulationEnv | None = None
+
+    def success(self, model: BaseAlgorithm) -> float:
+        config, count = self._config, self._config.evaluate_episodes
+        if self._env is None:
+            self._env = make_env(self._asset, count, action=config.action, randomize=config.randomize, hold=config.hold)
+        policy = Policy(model.policy, self._normal, config.hold)
+        return float(run_episodes(self._asset, policy, count, seed=EVALUATION_SEED, env=self._env)["success"].mean())
+
+    def close(self) -> None:
+        if self._env is not None:
+            self._env.close()
+
+
+def _quieten(model: BaseAlgorithm, config: Config, made: int) -> None:
+    """Hold PPO's exploration below a line that falls from where it began to ``anneal_to`` in ``anneal_steps``."""
+    if config.anneal_to is not None and config.algo == "ppo":
+        first = float(config.policy.get("log_std_init", 0.0))
+        share = min(made / config.anneal_steps, 1.0)
+        with torch.no_grad():
+            model.policy.log_std.clamp_(max=first + share * (config.anneal_to - first))
 
 
 def _evaluated_at(rows: list[list[float]]) -> float:
@@ -194,9 +220,9 @@ def _logger(folder: Path) -> Logger:
     return configure(str(folder / "tensorboard"), ["tensorboard"]) if found else Logger(None, [])
 
 
-def _write_results(folder: Path, model: BaseAlgorithm, normal: Normal, config: Config, asset: Asset,
-                   rows: list[list[float]]) -> None:
-    save_policy(folder / "policy.pt", model.policy, normal, config, asset.id)
+def _write_results(folder: Path, model: BaseAlgorithm, best: dict[str, Any] | None, normal: Normal, config: Config,
+                   asset: Asset, rows: list[list[float]]) -> None:
+    save_policy(folder / "policy.pt", model.policy, normal, config, asset.id, None if best is None else best["weights"])
     _write_curve(folder / "curve.csv", rows)
 
 
@@ -237,7 +263,7 @@ _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "
 def arrays_of(file: Path) -> dict[str, Any]:
     """A checkpoint; its parameters and generator stay tensors."""
     content = load_torch(file, FORMAT)
-    kept = {name: content.pop(name) for name in ("parameters", "variables", "torch")}
+    kept = {name: content.pop(name) for name in ("parameters", "variables", "torch", "best")}
     return {**arrays(content), **kept}
 
 

@@ -41,7 +41,9 @@ def curve(folder: Path) -> list[list[str]]:
         return [row[:-2] for row in csv.reader(f)]
 
 
-@pytest.mark.parametrize("config", [PPO, SAC], ids=["ppo", "sac"])
+@pytest.mark.parametrize("config", [Config(**{**PPO.as_dict(), "evaluate_every": 500, "evaluate_episodes": 2,
+                                              "enough": 2.0, "anneal_to": -1.0, "anneal_steps": 800}), SAC],
+                         ids=["ppo", "sac"])
 def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp_path: Path,
                                                 monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("train.run.CHUNK", 200)
@@ -197,14 +199,47 @@ def test_the_curve_does_not_begin_with_successes_alone(door: Asset) -> None:
     assert episodes.means()[0] == 0.5 and episodes.count == 2  # the second success began later
 
 
-def test_training_ends_when_an_evaluation_is_good_enough(door: Asset, tmp_path: Path) -> None:
-    config = Config(**{**PPO.as_dict(), "steps": 100_000, "randomize": False, "evaluate_every": 1,
-                       "evaluate_episodes": 3, "policy": {"net_arch": [16], "log_std_init": -4.0}})
-    done = train(door, config, tmp_path / "run")  # hardly any noise, and nothing randomised: the replay, which succeeds
-    assert done["evaluated"] == 1.0 and done["steps"] < 5000
-    assert train(door, config, tmp_path / "run")["resumed_at"] == done["steps"]  # it stays ended
-    seen = [row for row in csv.DictReader((tmp_path / "run" / "curve.csv").open(encoding="utf-8"))]
-    assert [row["evaluated"] for row in seen[:-1]] == ["nan"] * (len(seen) - 1)
+def test_the_best_policy_is_kept_and_a_perfect_one_ends_training(door: Asset, tmp_path: Path,
+                                                                 monkeypatch: pytest.MonkeyPatch) -> None:
+    from train import run
+
+    config = Config(**{**PPO.as_dict(), "evaluate_every": 256, "steps": 100_000})
+    answers, weights = [0.5, 0.7, 0.6, 1.0], []
+
+    def success(self: object, model: object) -> float:
+        weights.append({name: value.clone() for name, value in model.policy.state_dict().items()})
+        return answers[len(weights) - 1]
+
+    monkeypatch.setattr(run._Judge, "success", success)
+
+    def kept(of: int) -> bool:
+        held = load_policy(tmp_path / "run")[0].network.state_dict()
+        return all(torch.equal(held[name], value) for name, value in weights[of].items())
+
+    def look(share: float, row: dict) -> None:
+        if row["steps"] == 768:  # written at the end of the iteration before
+            assert kept(1) and not kept(0)
+
+    done = train(door, config, tmp_path / "run", progress=look)
+    assert done["evaluated"] == 1.0 and done["steps"] == 768 and kept(3)
+    assert train(door, config, tmp_path / "run")["resumed_at"] == 768  # it stays ended
+    with (tmp_path / "run" / "curve.csv").open(encoding="utf-8") as f:
+        assert [(row["steps"], float(row["evaluated"])) for row in csv.DictReader(f)] == [
+            ("0", 0.5), ("256", 0.7), ("512", 0.6), ("768", 1.0)]
+
+
+def test_a_replay_that_needs_no_training_is_left_as_it_is(door: Asset, tmp_path: Path) -> None:
+    config = Config(**{**PPO.as_dict(), "randomize": False, "evaluate_every": 1, "evaluate_episodes": 2})
+    done = train(door, config, tmp_path / "run")
+    assert done["evaluated"] == 1.0 and done["steps"] == 0
+    policy = load_policy(tmp_path / "run")[0]
+    assert not policy.act(np.random.default_rng(0).normal(size=(4, *policy.sizes[0]))).any()  # the replay
+
+
+def test_exploration_falls_along_its_line(door: Asset, tmp_path: Path) -> None:
+    config = Config(**{**PPO.as_dict(), "steps": 512, "anneal_to": -2.0, "anneal_steps": 256})
+    train(door, config, tmp_path / "run")
+    assert (load_policy(tmp_path / "run")[0].network.log_std < -1.9).all()
 
 
 def test_a_strip_shows_where_the_policy_wins(door: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
