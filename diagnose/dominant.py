@@ -23,6 +23,7 @@ CUT = 0.1  # of the nominal held-out error, that the whole set must leave at mos
 WITHOUT = 3.0  # times the held-out error, if the cause is left out
 SAME = 0.25  # relative deviation of its strength anywhere; friction that doubles over a log deviates by 0.33
 SEEN = 0.05  # share of the cause's effect that a part of the data must hold to be asked
+REST = 0.02  # of the largest speed, below which the part may be at rest
 RIVAL = 1.15  # times the held-out error within which another cause in its place does as well
 
 
@@ -42,6 +43,8 @@ def steadiness(causes: tuple[str, ...], terms: dict[str, float], fitted: Problem
     q, v, share = (np.concatenate(x) for x in zip(*[(e.q, e.v, e.t / e.t[-1]) for e in episodes], strict=True))
     number = np.concatenate([np.full(len(e.t), i) for i, e in enumerate(episodes)])
     lacking = np.concatenate([e.u - needed(plant, frame, e, row) for e in episodes])
+    # What sticks says nothing of a torque's size.
+    moving = np.abs(v) > REST * np.abs(v).max() if not fitted.driven else np.ones(len(v), bool)
     half = 0.5 * (q.min() + q.max())
     sides = {"low positions": q < half, "high positions": q >= half}
     ways = {"opening": v > 0, "closing": v < 0}
@@ -56,9 +59,10 @@ def steadiness(causes: tuple[str, ...], terms: dict[str, float], fitted: Problem
                 without[INDEX[p.term]] = 0.0
         # What the cause adds to the torque that the motion takes: a unit of it is its fitted strength.
         mine = np.concatenate([needed(plant, frame, e, row) - needed(plant, frame, e, without) for e in episodes])
-        total = float(mine @ mine)
+        total = float(mine[moving] @ mine[moving])
         worst = Steady(0.0, "")
         for where, mask in parts.items():
+            mask = mask & moving
             energy = float(mine[mask] @ mine[mask])
             if energy >= SEEN * total > 0:
                 deviation = abs(float(mine[mask] @ lacking[mask])) / energy

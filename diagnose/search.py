@@ -305,7 +305,8 @@ class Search:
         for name in found.dominant:
             rest = _less(best.causes, name)
             for other in self.names:
-                if other in UNNAMED or other in best.causes or not joins(list(rest), other):
+                if (other in UNNAMED or other in best.causes or name in CAUSES[other].contains
+                        or not joins(list(rest), other)):  # fmt: skip
                     continue
                 scored = self._judge(_sorted((*rest, other)))
                 if scored.held.rmse <= RIVAL_ERROR * best.held.rmse or (

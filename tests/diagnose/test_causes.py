@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnose.causes import CAUSES, PLACES, UNNAMED
+from diagnose.causes import CAUSES, PLACES, UNNAMED, free_torques
+from diagnose.kernel import KNOTS
 from diagnose.kernel import TERMS as KERNEL_TERMS
 from diagnose.log import JointLog
 from diagnose.plant import isolated, load_plant
@@ -53,6 +54,29 @@ def test_edit_agrees_with_the_fit(tmp_path, name, terms, tolerance, angle, ref):
     effect = np.abs(ours - nominal).max()
     assert effect > 0.02
     assert np.abs(real - ours).max() < max(tolerance, 2e-3)
+
+
+def test_free_torques_are_plain_mjcf(tmp_path):
+    """A torque over position and one over velocity, as knots, are what passive elements make of them."""
+    path = tmp_path / "m.xml"
+    path.write_text(XML.format(angle="radian", ref=0.2))
+    plant = load_plant(path, "j")
+    ep = episode(plant)
+    start = np.array([0.1, 0.0])
+    nominal = readings(plant, FRAME, ep, row_of({}), start)[0]
+    frame = Frame((float(nominal.min()), float(nominal.max())), (-5.0, 5.0))
+    over_q = 0.3 * np.cos(np.linspace(0, 4, KNOTS))
+    spline = np.concatenate([over_q, -0.02 * np.linspace(*frame.v, KNOTS)])
+    spec = mujoco.MjSpec.from_file(str(path))
+    free_torques.edit(spec, "j", spline, plant, frame)
+    model = isolated(mujoco.MjSpec.from_string(spec.to_xml()), "j")
+    assert model.nu == 0
+    Q, V = mujoco_rollouts(model, ep, [start])
+    real = shown(plant, frame, {}, Q[0], V[0], ep.t, model.opt.timestep)
+    ours = readings(plant, frame, ep, row_of({}), start, spline[None])[0]
+    inside = np.maximum.accumulate((ours < frame.q[0]) | (ours > frame.q[1])) == 0
+    assert inside.sum() > 50 and np.abs(ours - nominal)[inside].max() > 0.1
+    assert np.abs(real - ours)[inside].max() < 0.1 * np.abs(ours - nominal)[inside].max()
 
 
 def test_names_are_those_of_the_contract():
