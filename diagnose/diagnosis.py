@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from diagnose.causes import CAUSES, PLACES, Motion
+from diagnose.causes import CAUSES, PLACES, Motion, backlash
 from diagnose.fit import Candidate, Problem, fit
 from diagnose.log import JointLog, LogError, check_units, drop_stale, load_log
 from diagnose.measure import Measure, cause_of, extended, gain, remainder_of, rms
@@ -71,6 +71,13 @@ class Diagnosis:
             hold_second(spec, self.placed)
         return spec
 
+    def model_with_reading(self) -> mujoco.MjSpec:
+        """The extended model and, of a reading with play, a pointer that shows it (:mod:`diagnose.causes.backlash`)."""
+        spec = self.extended_spec()
+        if "backlash" in self.chosen.causes and self.verdict in ("explained", "ambiguous"):
+            backlash.add_pointer(spec, self.plant.joint, self.chosen.fit.terms()["play"], self.plant)
+        return spec
+
     @property
     def chosen(self) -> Scored:
         """What the extended model holds."""
@@ -89,7 +96,7 @@ class Diagnosis:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        spec = self.extended_spec()
+        spec = self.model_with_reading()
         for key in ("meshdir", "texturedir"):
             if spec.meshes or spec.textures:
                 setattr(spec, key, str((self.plant.path.parent / getattr(spec, key)).resolve()))

@@ -60,6 +60,12 @@ def revise(asset: Asset, result: Diagnosis, root: Path | None = None) -> Asset:
         data = json.loads((work / "asset.json").read_text(encoding="utf-8"))
         data["id"] = new_id
         data["provenance"] |= entries(result, model)
+        if result.placed is not None:
+            best = result.placed.found.best
+            if "axis_misalignment" in result.placed.causes:
+                data["joint"]["axis"] = best.axis.tolist()
+            if "pivot_offset" in result.placed.causes:
+                data["joint"]["point"] = best.anchor.tolist()
         data["diagnosis"] = {
             "revision_of": asset.id, "verdict": result.verdict, "causes": result.data["causes"],
             "heldout_rmse": {k: result.data[k]["heldout_rmse"] for k in ("nominal", "extended")},
@@ -71,8 +77,16 @@ def revise(asset: Asset, result: Diagnosis, root: Path | None = None) -> Asset:
 
 
 def entries(result: Diagnosis, model: mujoco.MjModel) -> dict[str, dict]:
-    """Provenance of the joint's numbers that the diagnosis fitted, as ``asset.json`` holds them."""
+    """Provenance of all numbers that the diagnosis fitted, as ``asset.json`` holds them.
+
+    The joint's own numbers have the names that domain randomisation draws by; those of other causes (catches, stops,
+    weights) are ``diagnosis.<cause>.<parameter>``. Standard deviations are a quarter of the reported intervals, which
+    are wider than the fit's own where something is left unexplained.
+    """
     std = result.found.best.fit.std()
+    reported = {c["name"]: c["parameters"] for c in result.data["causes"] if c["parameters"]}
+    if not reported and result.data["causes"]:  # unexplained: what explains part of it is under the evidence
+        reported = result.data["causes"][0]["evidence"].get("parameters", {})
     per_inertia = any("ratios to the inertia" in a for a in result.data["assumptions"])
     note = "fitted to measured motion" + (", as a ratio to the inertia: the inertia itself is as before"
                                           if per_inertia else "")  # fmt: skip
@@ -85,7 +99,31 @@ def entries(result: Diagnosis, model: mujoco.MjModel) -> dict[str, dict]:
         "joint.armature": ("inertia", float(joint.armature[0]), "kg m2" if result.plant.hinge else "kg"),
     }
     out: dict[str, dict] = {}
+    for cause, parameters in reported.items():
+        for name, p in parameters.items():
+            out[f"diagnosis.{cause}.{name}"] = {
+                "value": p["value"], "unit": p["unit"], "origin": "fitted", "std": _std(p), "note": note}  # fmt: skip
+    if "rest" in reported.get("spring", {}):
+        rest = reported["spring"]["rest"]
+        out["joint.springref"] = {
+            "value": float(model.qpos_spring[joint.qposadr[0]]), "unit": unit, "origin": "fitted", "std": _std(rest),
+            "note": note}  # fmt: skip
+    if result.placed is not None:
+        best = result.placed.found.best
+        if "axis_misalignment" in result.placed.causes:
+            out["joint.axis"] = {
+                "value": best.axis.tolist(), "unit": "1", "origin": "fitted", "note": "std: angle, rad",
+                "std": float(np.sqrt(np.trace(best.cov[:2, :2])))}  # fmt: skip
+        if "pivot_offset" in result.placed.causes:
+            out["joint.point"] = {"value": best.anchor.tolist(), "unit": "m", "origin": "fitted",
+                                  "std": float(np.sqrt(np.trace(best.cov[2:, 2:]))), "note": note}  # fmt: skip
     for key, (term, value, words) in numbers.items():
         if term in std and np.isfinite(std[term]):
             out[key] = {"value": value, "unit": words, "origin": "fitted", "std": float(std[term]), "note": note}
     return out
+
+
+def _std(parameter: dict) -> float:
+    """Standard deviation that a reported 95 % interval stands for."""
+    low, high = parameter["ci95"]
+    return float((high - low) / 3.92)

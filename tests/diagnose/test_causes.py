@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnose.causes import CAUSES, PLACES, UNNAMED, free_torques
+from diagnose.causes import CAUSES, PLACES, UNNAMED, backlash, free_torques
 from diagnose.kernel import KNOTS
 from diagnose.kernel import TERMS as KERNEL_TERMS
 from diagnose.log import JointLog
@@ -86,6 +86,43 @@ def test_names_are_those_of_the_contract():
     assert {*CAUSES, *PLACES} - set(UNNAMED) == contract
     terms = [p.term for c in CAUSES.values() for p in c.parameters]
     assert set(terms) <= set(KERNEL_TERMS)
+
+
+@pytest.mark.parametrize("kind", ["hinge", "slide"])
+def test_a_pointer_with_play_is_plain_mjcf(tmp_path, kind):
+    """The extended model's own sensor shows what the reading with play is taken to be."""
+    path = tmp_path / "m.xml"
+    path.write_text(f"""<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody><body pos="0 0 1">
+        <joint name="j" type="{kind}" axis="0 1 0" stiffness="3" damping=".02"/>
+        <geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.4" mass="1"/></body></worldbody></mujoco>""")
+    plant = load_plant(path, "j")
+    spec = mujoco.MjSpec.from_file(str(path))
+    backlash.add_pointer(spec, "j", 0.1, plant)
+    model = mujoco.MjModel.from_xml_string(spec.to_xml())
+    assert model.nu == 0
+    data = mujoco.MjData(model)
+    data.qpos[0] = 0.8
+    data.qpos[1] = -0.05  # at rest behind the part: it goes inwards first
+    q, read = [], []
+    for _ in range(3000):
+        mujoco.mj_step1(model, data)
+        q.append(data.qpos[0])
+        read.append(data.sensordata[0])
+        mujoco.mj_step2(model, data)
+    q, read = np.array(q), np.array(read)
+    want = np.empty_like(q)
+    held = read[0]
+    for k, x in enumerate(q):
+        held = min(max(held, x - 0.05), x + 0.05)
+        want[k] = held
+    assert np.ptp(q) > 0.8 and np.abs(read - want).max() < 0.005
+    plain = mujoco.MjModel.from_xml_path(str(path))
+    other = mujoco.MjData(plain)
+    other.qpos[0] = 0.8
+    for _ in range(2999):
+        mujoco.mj_step(plain, other)
+    mujoco.mj_step1(plain, other)
+    assert abs(other.qpos[0] - q[-1]) < 2e-3  # the part does not feel its pointer
 
 
 def test_hand_force_is_a_torque_about_the_axis(tmp_path):

@@ -70,6 +70,8 @@ def test_revision_is_an_environment_and_the_old_one_stays(tmp_path, monkeypatch)
     assert new.id == "coaster-r2" and (asset.path / "model.xml").read_bytes() == before
     entry = new.provenance["joint.frictionloss"]
     assert entry["origin"] == "fitted" and entry["std"] > 0 and "ratio to the inertia" in entry["note"]
+    same = new.provenance["diagnosis.coulomb_friction.friction"]
+    assert same["origin"] == "fitted" and same["std"] > 0
     assert new.metadata["diagnosis"]["revision_of"] == "coaster"
     assert uncertainties(new)["frictionloss"] == pytest.approx(np.log1p(entry["std"] / entry["value"]))
     taa_envs.register_assets()
