@@ -190,6 +190,13 @@ def model_path(model: Path | str) -> Path:
     return get_asset(str(model)).model_path
 
 
+def _one_way(episodes: list[Episode]) -> bool:
+    """True if less than a fiftieth of the way is in the other direction."""
+    ways = np.concatenate([np.diff(e.q) for e in episodes])
+    back, forth = float(-ways[ways < 0].sum()), float(ways[ways > 0].sum())
+    return min(back, forth) < 0.02 * (back + forth)
+
+
 def is_driven(plant: Plant, episodes: list[Episode]) -> bool:
     """True if inertia explains less than a twentieth of the logged input (rms): somebody moves the part slowly."""
     a = np.concatenate([e.a for e in episodes])
@@ -267,6 +274,10 @@ def _verdict(plant: Plant, found: Found, placed: Placed | None, names: list[str]
         experiment = "; or ".join(dict.fromkeys(
             text for n in sorted({*named, *places} ^ set(rivals[0]))
             if (text := (CAUSES[n] if n in CAUSES else PLACES[n]).experiment)))  # fmt: skip
+    if named and _one_way([*fitted.episodes, *held.episodes]):
+        assumptions.append("the part moves one way only in the logs: a torque over position may be a friction that "
+                           "changes with it")  # fmt: skip
+        experiment = experiment or "log the way back as well: friction turns round with the motion, a spring does not"
     if any(CAUSES[n].measurement for n in named):
         assumptions.append("faults of the measurement do not change the moving part of the extended model")
     whiteness = ljung_box(best.fit.residuals)

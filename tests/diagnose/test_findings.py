@@ -150,4 +150,5 @@ def test_cabinet_has_its_catch_where_the_pull_has_its_hump():
     terms = result.found.best.fit.terms()
     assert 0.1 < terms["detent_place"] + terms["detent_width"] < 0.25  # the pull peaks at 0.2 rad, over the rest
     assert d["extended"]["heldout_rmse"] < 0.1 * d["nominal"]["heldout_rmse"]
-    assert any("imposed" in a for a in d["assumptions"])
+    assert any("imposed" in a for a in d["assumptions"]) and any("one way only" in a for a in d["assumptions"])
+    assert "way back" in d["next_experiment"]
