@@ -332,16 +332,22 @@ def metric_depth_from_cue(cue: Arrays, frames: int) -> np.ndarray | None:
 def meshes_from_cue(folder: Path, names: Iterable[str] = MESHES) -> dict[str, LinkMesh]:
     """Those of ``meshes/static.glb`` and ``meshes/moving.glb`` that are there, with collision parts.
 
+    A heap of pieces becomes the one surface round them all, which has a volume and hence a mass; an open surface stays
+    as it is and only its collision parts are closed.
+
     Raises:
         TaaError: a file is not a mesh.
     """
-    from reconstruct.geometry.given import bounded_parts
+    from reconstruct.geometry.given import bounded_solid, nearest_colours
 
     links = {}
     for name in names:
         vertices, faces, colours = read_mesh(folder / name)
-        parts = bounded_parts(vertices, faces)
-        links[Path(name).stem] = LinkMesh(vertices, faces, colours, np.zeros(len(faces), bool), parts)
+        solid = bounded_solid(vertices, faces)
+        if solid.pieces > 1 and not solid.wrapped:
+            colours = nearest_colours(solid.vertices, vertices, colours)
+            vertices, faces = solid.vertices, solid.faces
+        links[Path(name).stem] = LinkMesh(vertices, faces, colours, np.zeros(len(faces), bool), solid.parts)
     return links
 
 

@@ -1,7 +1,8 @@
 """Where assets are found, and their registration as ``TAA/<id>``.
 
 Search path, first found wins: the assets shipped with the package, each folder in ``$TAA_ASSETS``, the user's data
-folder. A folder that is not a valid asset never stops an import: it is named once in a warning and left out.
+folder. A folder without an ``asset.json`` is somebody else's and passed over. An asset that is not valid never stops an
+import: it is left out, and one warning line names what was left out.
 """
 
 from __future__ import annotations
@@ -49,35 +50,46 @@ def search_folders() -> list[Path]:
     return folders
 
 
-def _warn_once(message: str) -> None:
-    if message not in _warned:
-        _warned.add(message)
-        warnings.warn(message, stacklevel=3)
+NAMED = 3
+"""Folders that a warning names; of the rest it gives the number."""
+
+
+def _warn_once(left_out: list[str]) -> None:
+    """One line for what was not yet warned about."""
+    new = [words for words in left_out if words not in _warned]
+    _warned.update(new)
+    if new:
+        more = f"; and {len(new) - NAMED} more" if len(new) > NAMED else ""
+        warnings.warn("; ".join(new[:NAMED]) + more, stacklevel=4)
 
 
 def _scan() -> dict[str, tuple[Path, dict]]:
     found: dict[str, tuple[Path, dict]] = {}
+    left_out: list[str] = []
     for root in search_folders():
         try:
             entries = sorted(root.iterdir()) if root.is_dir() else []
         except OSError as error:
-            _warn_once(f"assets in {root} were left out: {error}")
+            left_out.append(f"assets in {root} were left out: {error}")
             continue
         for folder in entries:
-            if folder.name.startswith(".") or not folder.is_dir():
-                continue  # being written, or not an asset at all
+            if folder.name.startswith("."):
+                continue  # being written
             try:
+                if not (folder / "asset.json").exists():
+                    continue  # not an asset at all
                 if not ID_PATTERN.fullmatch(folder.name):
                     raise AssetError(f"{folder.name!r} is not an asset id")
                 metadata = read_metadata(folder)
             except (AssetError, OSError) as error:
-                _warn_once(f"asset folder {folder} was left out: {error}")
+                left_out.append(f"asset folder {folder} was left out: {error}")
                 continue
             if folder.name in found:
                 first = found[folder.name][0]
-                _warn_once(f"asset folder {folder} was left out: {first} comes first on the search path")
+                left_out.append(f"asset folder {folder} was left out: {first} comes first on the search path")
                 continue
             found[folder.name] = (folder, metadata)
+    _warn_once(left_out)
     return found
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from reconstruct.cues import LinkMasks
 from reconstruct.errors import TaaError
 from reconstruct.geometry import LinkMesh
+from reconstruct.geometry.closing import zero_level
 from reconstruct.joint.models import JointFit
 
 SAMPLES = 4000
@@ -428,43 +429,9 @@ def _fuse_link(observations: list[tuple[Cloud, np.ndarray]]) -> LinkMesh:
     rgba = np.full((len(vertices), 4), 255, np.uint8)
     rgba[:, :3] = np.clip(np.median(colours[near], axis=1), 0, 255)
     far = tree.query(vertices[faces].mean(1))[0] > 2 * cell
-    from reconstruct.geometry.given import bounded_parts
+    from reconstruct.geometry.given import bounded_solid
     from reconstruct.geometry.solids import from_arrays, to_arrays
 
     # Contact needs no more than a cell's precision, and the decomposition's time grows with the faces.
     plain = to_arrays(from_arrays(vertices, faces).simplify(1.2 * cell))
-    return LinkMesh(vertices, faces, rgba, far, bounded_parts(*plain))
-
-
-def zero_level(field: np.ndarray, low: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Closed surface of the zero level of a field on a grid, positive inside; small pieces are dropped.
-
-    Raises:
-        TaaError: nothing is inside.
-    """
-    from manifold3d import Manifold
-
-    from reconstruct.geometry.solids import largest_piece, to_arrays
-
-    if not (field > 0).any():
-        raise TaaError("the key frames' meshes do not agree on any solid; give better meshes or fewer")
-    nx, ny, nz = field.shape
-    values = field.tolist()
-
-    def at(x: float, y: float, z: float) -> float:
-        """Trilinear interpolation, in plain Python: the caller asks one point at a time."""
-        u, v, w = (x - low[0]) / cell, (y - low[1]) / cell, (z - low[2]) / cell
-        i, j, k = int(u), int(v), int(w)
-        if u < 0 or v < 0 or w < 0 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1:
-            return -cell
-        a, b, c = u - i, v - j, w - k
-        p, r = values[i], values[i + 1]
-        near = (p[j][k] * (1 - c) + p[j][k + 1] * c) * (1 - b) + (p[j + 1][k] * (1 - c) + p[j + 1][k + 1] * c) * b
-        far = (r[j][k] * (1 - c) + r[j][k + 1] * c) * (1 - b) + (r[j + 1][k] * (1 - c) + r[j + 1][k + 1] * c) * b
-        return near * (1 - a) + far * a
-
-    high = low + cell * (np.array(field.shape) - 1)
-    solid = Manifold.level_set(at, [*low.tolist(), *high.tolist()], cell, 0.0)
-    if solid.is_empty():
-        raise TaaError("the key frames' meshes do not agree on any solid; give better meshes or fewer")
-    return to_arrays(largest_piece(solid, 0.05).simplify(0.3 * cell))
+    return LinkMesh(vertices, faces, rgba, far, bounded_solid(*plain).parts)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from reconstruct.cues import Hands, LinkMasks, Tracks
@@ -45,7 +43,6 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         raise TaaError("the moving link has fewer than three points; film it closer or with more texture")
     if not masks.moving.any():
         raise TaaError("the moving link's silhouette was found in no frame; film it from where it can be seen")
-    started = time.perf_counter()
     notes: list[str] = []
     plane = fit_plane(tracks, fit)
     good = points_on_mask(video, tracks, fit, masks)
@@ -117,7 +114,6 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         "clearance": entry(clearance, "assumed", unit=unit),
         "contacts_over_range": entry(verdict["contacts"], "observed", states=verdict["states"],
                                      penetration=verdict["penetration"]),
-        "seconds": entry(round(time.perf_counter() - started, 2), "observed"),
     }
     return Geometry(static, moving, provenance, tuple(notes))
 

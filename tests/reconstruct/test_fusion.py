@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import LinkMasks
 from reconstruct.errors import TaaError
-from reconstruct.geometry.fusion import KeyMesh, fuse_meshes, ground, noise_of, sample, similarity, zero_level
+from reconstruct.geometry.closing import zero_level
+from reconstruct.geometry.fusion import KeyMesh, fuse_meshes, ground, noise_of, sample, similarity
 from reconstruct.joint.models import JointFit
 
 SIZE = (320, 240)

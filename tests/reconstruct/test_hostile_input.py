@@ -320,7 +320,7 @@ def test_meshes_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.slow
 def test_a_mesh_that_cuts_through_itself_is_cut_or_given_up_in_time() -> None:
     """The fuzzer's: a box with corners moved through its faces, on which the decomposition may run for ever."""
-    from reconstruct.geometry.given import bounded_parts
+    from reconstruct.geometry.given import bounded_solid, make_solid
 
     corners = (
         np.array(
@@ -345,16 +345,19 @@ def test_a_mesh_that_cuts_through_itself_is_cut_or_given_up_in_time() -> None:
         ]
     )
     # Whether it ends depends on the build of the decomposition and its threads; that somebody waits for it must not.
-    with pytest.raises(TaaError, match="convex parts within"):
-        bounded_parts(corners, faces, seconds=0.05)
+    with pytest.raises(TaaError, match="convex parts in time"):
+        bounded_solid(corners, faces, seconds=0.05)
+    # The wrapped surface has an answer whatever the given one is.
+    solid = make_solid(corners, faces, wrapped=True)
+    assert solid.wrapped and len(solid.parts) >= 1 and trimesh.Trimesh(solid.vertices, solid.faces).is_watertight
     begin = time.monotonic()
     try:
-        assert len(bounded_parts(corners, faces, seconds=8.0)) >= 1
+        assert len(bounded_solid(corners, faces, seconds=8.0).parts) >= 1
     except TaaError as error:
         assert "convex parts" in str(error)
     assert time.monotonic() - begin < 60
     box = trimesh.creation.box()
-    ((vertices, _),) = bounded_parts(np.asarray(box.vertices), np.asarray(box.faces))
+    ((vertices, _),) = bounded_solid(np.asarray(box.vertices), np.asarray(box.faces)).parts
     assert len(vertices) == 8
 
 

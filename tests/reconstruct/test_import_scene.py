@@ -303,3 +303,40 @@ def test_fit_gives_the_joint_back_from_the_imported_scene(imported, truth, capfd
     assert unit * SCALE == pytest.approx(1.0, abs=0.4)
     tracked = np.array(joint["q"], float)[: FRAMES - 1 : 2]
     assert np.ptp(tracked) == pytest.approx(np.ptp(truth.q[: FRAMES - 1 : 2]), rel=0.02)
+
+
+@pytest.mark.slow
+def test_an_imported_scene_becomes_an_asset(imported, truth, tmp_path, capfd):
+    """`taa import-scene`, then `taa reconstruct --scene`: meshes that are heaps of overlapping boxes, a saved asset."""
+    import trimesh
+
+    from taa_envs import cli
+    from taa_envs.asset import load_asset
+    from taa_envs.exports.usd import read_obj
+
+    source, _, _ = imported
+    scene = tmp_path / "scene"
+    assert cli.main(["import-scene", str(source), str(scene), "--rate", "10", "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    code = cli.main(["reconstruct", facts["video"], "--id", "imported", "--scene", str(scene), "--out", str(tmp_path),
+                     "--json"])  # fmt: skip
+    made = json.loads(capfd.readouterr().out)
+    assert code == 0 and made["asset"] == str(tmp_path / "imported")
+    asset = load_asset(tmp_path / "imported")
+    assert asset.joint["type"] == truth.type and asset.metadata["gate"]["passed"]
+    assert asset.provenance["moving_mesh"]["origin"] == asset.provenance["static_mesh"]["origin"] == "given"
+    # The door is five boxes that overlap; what overlaps is not counted twice in its volume, whatever the unit.
+    heap = link_meshes(truth)["moving"]
+    door = trimesh.boolean.union(heap.split(), engine="manifold")
+    volume = asset.provenance["moving.mass"]["value"] / asset.provenance["moving.density"]["value"]
+    vertices, _, _ = read_obj(asset.path / "meshes" / "moving.obj")
+    unit = asset_size(vertices) / asset_size(np.asarray(door.vertices))
+    assert volume / unit**3 == pytest.approx(door.volume, rel=0.02) and door.volume < 0.97 * heap.volume
+    print(made["replay"])
+
+
+def asset_size(vertices: np.ndarray) -> float:
+    """Largest distance between two corners, the same in any frame."""
+    from scipy.spatial.distance import pdist
+
+    return float(pdist(vertices).max())

@@ -63,16 +63,25 @@ def test_broken_folders_are_named_once_and_left_out(only_here: Path, door: Asset
     (here / "broken" / "asset.json").write_text("{")
     (here / ".door.tmp").mkdir()
     (here / "readme.txt").write_text("not a folder")
+    (here / "Photos 2024").mkdir()
+    (here / "Photos 2024" / "asset.jpg").write_text("somebody else's folder")
     with pytest.warns(UserWarning, match="broken was left out") as caught:
         assert taa_envs.register_assets() == ["TAA/door"]
     assert len(caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         taa_envs.register_assets()
+    for name in "abcde":
+        (here / f"broken-{name}").mkdir()
+        (here / f"broken-{name}" / "asset.json").write_text("[]")
+    with pytest.warns(UserWarning, match="broken-a was left out.*; and 2 more$") as caught:
+        assert taa_envs.register_assets() == ["TAA/door"]
+    assert len(caught) == 1, "one line, however many are broken"
 
 
 def test_import_is_light_and_survives_a_broken_asset(tmp_path: Path) -> None:
     (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "asset.json").write_text("{")
     code = ("import sys, time; import numpy, gymnasium; t = time.perf_counter(); import taa_envs; "
             "print(time.perf_counter() - t, [m for m in ('torch', 'cv2', 'reconstruct', 'train', 'diagnose', 'mujoco') "
             "if m in sys.modules])")
