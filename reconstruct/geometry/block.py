@@ -26,6 +26,8 @@ DISTINCT = 0.1
 """Contrast times share from which a region of the picture counts as a body of its own."""
 CONTRAST = 0.4
 """A body that differs less from its surroundings is not cut out of them."""
+FLAT = 0.85
+"""Of a face's normal, upwards: beyond it the link lies flat."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class StaticBlock:
         depth: of the block along the closing direction.
         seen: (h, w) bool, the body's pixels on the plate (the picture shrunk), or None where it could not be told
             from its surroundings.
+        beneath: it lies behind the link's face, which slides along itself, and not where the link slides to.
     """
 
     solid: Manifold
@@ -46,6 +49,7 @@ class StaticBlock:
     decided: bool
     depth: float
     seen: np.ndarray | None
+    beneath: bool = False
 
 
 def place_block(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, masks: LinkMasks, costs: np.ndarray,
@@ -77,8 +81,13 @@ def place_block(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mas
     path = _covered(plate, fit, shape, plane, ends)
     slides_in_plane = fit.type == "prismatic" and abs(float(plane.pose[:3, 2] @ fit.axis)) < 0.7
     found, scores = [], []
-    for end in ends:
-        box, about = static_box(shape, plane, fit, end, clearance)
+    # A bar that slides along itself comes out of a body; a lid or a door that does so lies on one. What lies flat (the
+    # world's z is up) rests on something wherever it is.
+    flat = slides_in_plane and float(plane.pose[2, 2]) > FLAT
+    kinds = (True,) if flat else (False, True) if slides_in_plane else (False,)
+    places = [(end, beneath) for beneath in kinds for end in ends]
+    for end, beneath in places:
+        box, about = static_box(shape, plane, fit, end, clearance, beneath=beneath)
         corners, _ = to_arrays(box)
         uv = project(plate, fit, corners)
         region = fill_hull(plate, uv)
@@ -87,7 +96,7 @@ def place_block(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mas
         here = region & ~path
         hands = float(reach[here].mean()) if here.any() else 0.0
         wide, area = box, region
-        if slides_in_plane:
+        if slides_in_plane and not beneath:
             wide, _ = static_box(shape, plane, fit, end, clearance, WIDEN)
             area = fill_hull(plate, project(plate, fit, to_arrays(wide)[0]))
         # Where the block is too small its surroundings are the body itself: of two borders the clearer counts.
@@ -106,12 +115,16 @@ def place_block(video: Video, fit: JointFit, plane: LinkPlane, shape: Shape, mas
         score = (likeness + distinct) * (1 - min(1.0, 2 * hands)) * min(1.0, inside) * (1 - hides) ** 2
         scores.append(score)
         found.append((box, cut, about["depth"], whole))
-    first = int(np.argmin(np.abs(np.array(ends) - fit.q[0])))
-    chosen = first if scores[first] >= scores[1 - first] else 1 - first
-    decided = scores[chosen] > 1.3 * scores[1 - chosen] + 0.02
+    chosen = int(np.argmax(scores))
+    rival = max(score for (end, _), score in zip(places, scores, strict=True) if end != places[chosen][0])
+    decided = scores[chosen] > 1.3 * rival + 0.02
+    first = ends[int(np.argmin(np.abs(np.array(ends) - fit.q[0])))]
+    best = {end: max(score for (e, _), score in zip(places, scores, strict=True) if e == end) for end in ends}
     box, cut, depth, whole = found[chosen]
     solid, seen = (box, None) if cut is None else (cut, whole)
-    return StaticBlock(solid, ends[chosen], {"start": scores[first], "other": scores[1 - first]}, decided, depth, seen)
+    other = ends[1 - ends.index(first)]
+    likeness = {"start": best[first], "other": best[other]}
+    return StaticBlock(solid, places[chosen][0], likeness, decided, depth, seen, places[chosen][1])
 
 
 def _cut(plate: Plate, fit: JointFit, wide: Manifold, region: np.ndarray) -> Manifold | None:

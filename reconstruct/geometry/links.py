@@ -16,6 +16,7 @@ from reconstruct.geometry.outline import build_shape
 from reconstruct.geometry.plane import fit_plane, keep_points
 from reconstruct.geometry.solids import carve, extrude, hull, swept_hulls, to_arrays
 from reconstruct.geometry.texture import paint, subdivide, vertex_normals
+from reconstruct.geometry.tray import assume_tray, with_tray
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -59,7 +60,12 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
 
     surface, _ = subdivide(vertices, faces, 800)
     block = place_block(video, fit, plane, shape, masks, costs, surface, clearance)
-    clouds = swept_hulls(parts, fit, clearance)
+    tray = assume_tray(fit, plane, shape, block.end, block.depth)
+    clouds = swept_hulls(parts if tray is None else (*parts, tray.room), fit, clearance)
+    if tray is not None:
+        vertices, faces = to_arrays(with_tray(solid, tray))
+        parts = (*parts, *tray.plates)
+        notes.append("the drawer's tray was not seen: a bottom, sides and a back are assumed behind its front")
     if hand_points is not None:
         clouds = clouds + _hand_clouds(np.asarray(hand_points, float), clearance)
     box = block.solid
@@ -68,7 +74,8 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
     plain = trim_parts((to_arrays(box),), clouds)
     if plain and hull(plain[0][0]).volume() > 0.85 * body.volume():
         body = hull(plain[0][0])
-    left = body.volume() / max(box.volume(), 1e-30)
+    hollow = hull(tray.room[0]).volume() if tray is not None else 0.0  # meant to be empty
+    left = body.volume() / max(box.volume() - hollow, 1e-30)
     if left < 0.05:
         raise TaaError("no room for the static part beside the moving one's path; check the joint's range")
     if left < 0.5:
@@ -104,7 +111,8 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         "moving_silhouette_iou": entry(shape.iou, "observed"),
         "moving_reach_to_hand": entry(shape.reach, "fitted" if shape.reach else "assumed", unit=unit),
         "moving_seen_faces": entry(float(1 - moving.assumed.mean()), "observed"),
-        "moving_parts": entry(convexity["parts"], "fitted", **{k: v for k, v in convexity.items() if k != "parts"}),
+        "moving_parts": entry(len(parts), "fitted", **{k: v for k, v in convexity.items() if k != "parts"}),
+        "moving_tray_depth": entry(0.0 if tray is None else tray.depth, "assumed", unit=unit),
         "static_depth": entry(block.depth, "assumed", unit=unit),
         "static_closed_at": entry(block.end, "fitted" if block.decided else "assumed", unit=fit.unit,
                                   likeness=block.scores),

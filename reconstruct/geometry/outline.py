@@ -283,10 +283,10 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
                 trials[behind, front] = draw(-behind * extent, front * extent) - 0.02 * (behind + front)
     best = max(trials, key=lambda k: trials[k])
     assumed = -unseen, 0.0
-    if trials[best] > draw(*assumed) - 0.02 * unseen / extent + gain:
+    # Less than half of what is assumed is the end of the scale: silhouettes whose rims are a pixel wide say nothing.
+    told = sum(best) * extent >= 0.5 * unseen
+    if told and trials[best] > draw(*assumed) - 0.02 * unseen / extent + gain:
         low, high, origin = -best[0] * extent, best[1] * extent, "fitted"
-        if high - low < 0.5 * unseen:
-            low = high - 0.5 * unseen
     else:
         (low, high), origin = assumed, "assumed"
     slab = Shape((Slice(outline, low, high),), draw(low, high), origin, "slab", reach)

@@ -127,7 +127,7 @@ def closing_direction(fit: JointFit, centre: np.ndarray, end: float) -> np.ndarr
 
 
 def static_box(shape: Shape, plane: LinkPlane, fit: JointFit, end: float, clearance: float,
-               widen: float = 0.0) -> tuple[Manifold, dict]:
+               widen: float = 0.0, beneath: bool = False) -> tuple[Manifold, dict]:
     """The assumed static body: what the link closes onto at state ``end``, as a block behind it.
 
     The block has the link's outline box across the closing direction and, along it, a depth in
@@ -136,6 +136,8 @@ def static_box(shape: Shape, plane: LinkPlane, fit: JointFit, end: float, cleara
 
     Args:
         widen: how much more room to give it across, on every side, in parts of the link's longest side.
+        beneath: behind the link's face, away from the side that was seen, wherever the link comes from: what a lid or
+            a door that slides along itself covers.
     """
     pose = fit.link_pose(end) @ plane.pose
     low, high = shape.bounds
@@ -144,10 +146,12 @@ def static_box(shape: Shape, plane: LinkPlane, fit: JointFit, end: float, cleara
     direction = pose[:3, :3].T @ closing_direction(fit, centre, end)
     k = int(np.argmax(np.abs(direction)))
     sign = 1.0 if direction[k] > 0 else -1.0
+    if beneath:
+        k, sign = 2, -1.0
     across = np.delete(size, k)
     # Behind a face (door, lid): a body nearly as deep as the face is wide. Under an arm: one as thick as the arm.
     depth = 0.8 * float(across.min()) if k == 2 else float(size[k])
-    if fit.type == "prismatic":
+    if fit.type == "prismatic" and not beneath:
         depth = max(depth, 1.15 * float(np.ptp(fit.q)))
     box_low, box_high = low.copy(), high.copy()
     grow = 0.02 * float(np.linalg.norm(size)) + 2 * clearance + widen * float(size.max())

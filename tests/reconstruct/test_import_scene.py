@@ -325,13 +325,13 @@ def test_an_imported_scene_becomes_an_asset(imported, truth, tmp_path, capfd):
     asset = load_asset(tmp_path / "imported")
     assert asset.joint["type"] == truth.type and asset.metadata["gate"]["passed"]
     assert asset.provenance["moving_mesh"]["origin"] == asset.provenance["static_mesh"]["origin"] == "given"
-    # The door is five boxes that overlap; what overlaps is not counted twice in its volume, whatever the unit.
+    # The door is a heap of five boxes; its mass is that of the one body they make, whatever the unit.
     heap = link_meshes(truth)["moving"]
     door = trimesh.boolean.union(heap.split(), engine="manifold")
     volume = asset.provenance["moving.mass"]["value"] / asset.provenance["moving.density"]["value"]
     vertices, _, _ = read_obj(asset.path / "meshes" / "moving.obj")
     unit = asset_size(vertices) / asset_size(np.asarray(door.vertices))
-    assert volume / unit**3 == pytest.approx(door.volume, rel=0.02) and door.volume < 0.97 * heap.volume
+    assert volume / unit**3 == pytest.approx(door.volume, rel=0.02)
     print(made["replay"])
 
 
