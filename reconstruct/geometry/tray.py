@@ -31,7 +31,7 @@ HEIGHT = 0.8
 """Of the tray's sides, in parts of the front's height less the inset."""
 WALL = 0.025
 """Thickness, in parts of the front's smaller side; at least 6 mm."""
-RECTANGULAR = 0.7
+RECTANGULAR = 0.75
 """Intersection over union of a front with its best rectangle below which nobody knows what is behind it."""
 
 
@@ -101,8 +101,9 @@ def assume_tray(fit: JointFit, plane: LinkPlane, shape: Shape, end: float, depth
     return Tray(plates, plate((a[0], b[0]), (a[1], b[1]), inside), depth)
 
 
-def best_rectangle(ring: np.ndarray, cells: int = 40) -> tuple[np.ndarray, np.ndarray, float]:
-    """The rectangle along the axes that agrees most with a polygon (k, 2): low and high corner, intersection over union.
+def best_rectangle(ring: np.ndarray, cells: int = 32) -> tuple[np.ndarray, np.ndarray, float]:
+    """The rectangle along the axes that agrees most with a polygon (k, 2): its low and high corner, and their
+    intersection over union.
 
     A ragged side or a neighbour taken in moves it less than they move the bounding box.
     """
