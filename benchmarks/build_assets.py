@@ -5,8 +5,8 @@
     python -m benchmarks.build_assets --work build/assets   # keeps clips and scenes: a second run resumes
 
 Nothing but the video reaches the reconstruction; the truth beside the clip is read afterwards, for the table that is
-printed and written into ``assets/README.md``. A clip that is refused, whose joint has the wrong type, or whose replay
-moves the part by less than half, is a row of the table and does not ship.
+printed and written into ``assets/README.md``. A clip that is refused, whose joint has the wrong type, whose
+replay moves the part by less than half, or whose replay a control equals, is a row of the table and does not ship.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ CLIPS = ("demo", "locker", "cabinet", "drawer", "crate", "box", "laptop", "oven"
 PREFIX = "synth-"
 """Of the ids: an asset that a user calls ``drawer`` must not stand behind one of ours."""
 LEAST_PROGRESS = 0.5
+MOST_CONTROL = 0.5
+"""A part that moves as far without the hand's push says nothing about the push."""
 MAX_BYTES = 20_000_000
 LEFT_OUT = ("*.mp4", "report.html")
 """Films weigh more than all else; ``--work`` keeps the whole folders."""
@@ -62,6 +64,8 @@ def build(clip: str, work: Path) -> dict:
         row["asset"] = None
     elif row["progress"] < LEAST_PROGRESS:
         row |= {"asset": None, "words": f"replay reaches {row['progress']:.0%} only"}
+    elif row["control"] > MOST_CONTROL:
+        row |= {"asset": None, "words": f"a control reaches {row['control']:.0%}"}
     return row
 
 
@@ -113,7 +117,6 @@ def main(argv: list[str] | None = None) -> int:
             print(clip, file=sys.stderr, flush=True)
             row = build(clip, work)
             target = arguments.out / (PREFIX + clip)
-            shutil.rmtree(target, ignore_errors=True)
             shutil.rmtree(target, ignore_errors=True)
             if row["asset"] is not None:
                 shutil.copytree(row["asset"], target, ignore=shutil.ignore_patterns(*LEFT_OUT))
