@@ -25,8 +25,8 @@ import numpy as np
 from reconstruct.synth.animation import look_at
 
 SAMPLES = 20_000
-SIZE = (768, 432)
-FRAMES = 90
+SIZE = (640, 360)
+FRAMES = 60
 
 
 def surface_points(solids: list[tuple[np.ndarray, np.ndarray]], seed: int = 0) -> np.ndarray:
