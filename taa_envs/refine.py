@@ -18,7 +18,7 @@ import numpy as np
 from taa_envs.asset import Asset, Reference
 from taa_envs.corrections import NAMES, Corrections
 from taa_envs.replay import ReplayResult, replay, simulate
-from taa_envs.rollouts import Rollout, Rollouts
+from taa_envs.rollouts import OutOfTime, Rollout, Rollouts
 from taa_envs.scene import build_scene
 from taa_envs.simulation import Diverged, HandPath
 
@@ -101,7 +101,9 @@ def refine(asset: Asset, hand: str = "points", *, seed: int = 0, seconds: float 
         asset: as loaded; its own demonstration is the start.
         hand: name of the hand that replays.
         seed: of the draws.
-        seconds: no generation is begun that would end after this; the result of a seed can depend on it.
+        seconds: of wall time for all of it. What is running when they are up, less what a last replay of the result
+            takes, is given up: on a busy machine fewer corrections are tried. Only the replay of the demonstration is
+            always made. The result of a seed can depend on it.
         threads: 0 for one a core.
         progress: told the share that is done.
 
@@ -115,6 +117,8 @@ def refine(asset: Asset, hand: str = "points", *, seed: int = 0, seconds: float 
     """
     begin = time.monotonic()
     before = replay(asset, hand)
+    check = time.monotonic() - begin  # what a replay with its controls costs; the result needs one more
+    deadline = begin + seconds - 1.2 * check
     scene = build_scene(asset, hand)
     corrections = Corrections.of(asset)
     runs = Rollouts(scene, POPULATION, threads)
@@ -128,7 +132,10 @@ def refine(asset: Asset, hand: str = "points", *, seed: int = 0, seconds: float 
         draws = np.clip(mean + spread * rng.standard_normal((POPULATION, n)), -BOUND, BOUND)
         if generation == 0:
             draws[0] = 0.0
-        done = runs.run([corrections.path(z) for z in draws])
+        try:
+            done = runs.run([corrections.path(z) for z in draws], deadline)
+        except OutOfTime:
+            break
         count += POPULATION
         # Of two that replay alike the one nearer to what was seen is better.
         scores = np.array([score(asset, r) for r in done]) - 0.01 * (draws**2).mean(1)
@@ -143,7 +150,7 @@ def refine(asset: Asset, hand: str = "points", *, seed: int = 0, seconds: float 
         if progress:
             progress((generation + 1) / (GENERATIONS + 1))
         now = time.monotonic()
-        if now - begin + 3.0 * (now - began) > seconds:  # the finalists take two more
+        if now + 3.0 * (now - began) > deadline:  # the finalists take two more
             break
         if len(tried) >= ELITE and tried[ELITE - 1][0] > GOOD:
             break
@@ -152,16 +159,19 @@ def refine(asset: Asset, hand: str = "points", *, seed: int = 0, seconds: float 
     if found:
         # Not the luckiest: the one that still works when the hand is off by millimetres and milliseconds.
         paths = [disturbed(corrections.path(z)) for z in (*found, np.zeros(n))]
-        done = runs.run([p for group in paths for p in group])
-        count += len(done)
         each = len(paths[0])
-        worth = [float(np.mean([max(score(asset, r), -1.0) for r in done[k * each:(k + 1) * each]]))
-                 for k in range(len(paths))]
+        try:
+            done = runs.run([p for group in paths for p in group], deadline)
+            count += len(done)
+            worth = [float(np.mean([max(score(asset, r), -1.0) for r in done[k * each:(k + 1) * each]]))
+                     for k in range(len(paths))]
+        except OutOfTime:  # then the luckiest will have to do
+            worth = [0.0] * len(paths)
         nominal = [s for s, z in tried[:FINALISTS] if s > start + 1e-3 and z.any()]
         order = np.argsort([-(a + b) for a, b in zip(nominal, worth[:-1], strict=True)])
         limit = max(CONTROL_LIMIT, *before.controls.values()) if before.controls else CONTROL_LIMIT
         for k in order:
-            if nominal[k] + worth[k] <= start + worth[-1]:
+            if nominal[k] + worth[k] <= start + worth[-1] or time.monotonic() > deadline + 0.2 * check:
                 break
             result = replay(replace(asset, reference=corrected(asset, corrections.path(found[k]))), hand)
             if max(result.controls.values()) <= limit and result.joint_progress >= before.joint_progress - 1e-3:

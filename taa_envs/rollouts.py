@@ -6,6 +6,7 @@ passive here as there.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,12 @@ from taa_envs.hands.rig import JointedController
 from taa_envs.rows import BatchRows, hand_rows
 from taa_envs.scene import Scene, decode_touch, touch_columns
 from taa_envs.simulation import HandPath
+
+LOOK = 20  # steps between two looks at the clock
+
+
+class OutOfTime(Exception):
+    """The replays were not done when their time was up."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,8 @@ class _JointedRows:
             self._controller.place(self._data[k], joints[k])
 
     def control(self, target: np.ndarray) -> None:
-        for data, joints, time in zip(self._data, target, self._rows.time, strict=True):
-            data.time = float(time)
+        for data, joints, now in zip(self._data, target, self._rows.time, strict=True):
+            data.time = float(now)
             self._controller.control(data, joints)
 
 
@@ -79,15 +86,19 @@ class Rollouts:
         jointed = isinstance(scene.hand, JointedController)
         self._hand = _JointedRows(scene.hand, self._rows) if jointed else hand_rows(scene, self._rows)
 
-    def run(self, paths: Sequence[HandPath]) -> list[Rollout]:
-        """Replay every path from the reference's first frame to the demonstration's end plus :data:`HOLD`."""
+    def run(self, paths: Sequence[HandPath], deadline: float = np.inf) -> list[Rollout]:
+        """Replay every path from the reference's first frame to the demonstration's end plus :data:`HOLD`.
+
+        Raises:
+            OutOfTime: ``time.monotonic()`` passed the deadline, s, before all were done.
+        """
         out: list[Rollout] = []
         for first in range(0, len(paths), self.n):
             some = list(paths[first:first + self.n])
-            out += self._together([*some, *[some[-1]] * (self.n - len(some))])[:len(some)]
+            out += self._together([*some, *[some[-1]] * (self.n - len(some))], deadline)[:len(some)]
         return out
 
-    def _together(self, paths: list[HandPath]) -> list[Rollout]:
+    def _together(self, paths: list[HandPath], deadline: float) -> list[Rollout]:
         scene, rows, hand, n = self.scene, self._rows, self._hand, self.n
         asset, model = scene.asset, scene.model
         reference, end = asset.reference, asset.demo["demo_end_frame"]
@@ -105,6 +116,8 @@ class Rollouts:
         depth, bad = np.zeros(n), np.zeros(n, bool)
         q[:, 0], frame, clock = rows.qpos[:, scene.qpos], 0, rows.time
         for i in range(int(np.ceil((stop - start) / dt))):
+            if i % LOOK == 0 and time.monotonic() > deadline:
+                raise OutOfTime
             t = start + i * dt
             while t >= edges[frame + 1] and frame < end:
                 frame += 1

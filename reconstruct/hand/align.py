@@ -15,7 +15,17 @@ import numpy as np
 from reconstruct.cues import HandReference, Hands, LinkMasks
 from reconstruct.geometry import Geometry
 from reconstruct.hand.drive import Drive, close_gaps, find_drive, moving_frames, runs
-from reconstruct.hand.grip import ACROSS_STD, HALF_HAND, PRESS, RADII, RAY_STD, Grip, Sighting, find_grips
+from reconstruct.hand.grip import (
+    ACROSS_STD,
+    HALF_HAND,
+    PRESS,
+    RADII,
+    RAY_STD,
+    Grip,
+    Sighting,
+    find_grips,
+    pushing_spheres,
+)
 from reconstruct.hand.holds import Part, assumed_handle
 from reconstruct.hand.path import clear_path, exit_direction
 from reconstruct.hand.pnp import hand_positions
@@ -25,6 +35,7 @@ from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
 ONSET = 0.1  # s before the part moves in which a touching hand begins to press
+MAX_BACK = 0.03  # m by which a waiting hand stays back from its grip at most
 FOUND_SECONDS = 0.15  # a hand that holds on so soon after it is found was holding on before
 DEPTH_FLOOR, ACROSS_FLOOR = 0.01, 0.005  # m, least standard deviations of an aligned hand
 TIPS_STD = 0.005  # m of a finger tip: landmark noise of 4 % of a palm, and the 4 mm by which tips are pressed in
@@ -221,7 +232,7 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         for a, b in runs(attached):
             own[a:b] = _smooth(own[a:b], 0.1 * rate)
         still = _from_link(pose, own + (grip.pose - rest))
-    held = still - _waiting(fit, pose, grip, moving, sign, rate)
+    held = still - _waiting(shape, fit, pose, grip, moving, sign, rate)
     joints = _assemble(shape, world, held, pose, attached, grip, rate)
     notes.append(f"{grip.kind}: {grip.pushing} contact spheres on faces that look against the motion; hand moved by "
                  f"{1e3 * np.linalg.norm(grip.shift):.0f} mm and {np.degrees(grip.turn):.0f} deg from where it was "
@@ -237,13 +248,14 @@ def _choose(shape: LinkShape, fit: JointFit, sign: float, rest: np.ndarray, ray:
     """The grip nearest to the evidence, the link as it is then, and what had to be added to the link for it."""
     grips = find_grips(shape, fit, sign, rest, ray, sighting=sighting)
     if not grips or sighting.off(grips[0], ray) > DOUBT or grips[0].hidden > 1:
-        handle = assumed_handle(shape, fit, sign, rest)
+        handle = assumed_handle(shape, fit, sign, rest, ray)
         if handle is not None:
             parts, moved = handle
             more = shape.with_parts(parts)
             held = find_grips(more, fit, sign, moved, ray, sighting=sighting)
-            for k, grip in enumerate(held):  # its shift is from where the hand was seen, not from where it is clear
-                held[k] = replace(grip, shift=grip.shift + (moved - rest).mean(0))
+            # Its shift is from where the hand was seen, not from where it is clear.
+            held = [replace(grip, shift=grip.shift + (moved - rest).mean(0)) for grip in held]
+            held = [grip for grip in held if grip.hidden <= 1 and sighting.off(grip, ray) <= DOUBT]
             if held and (not grips or held[0].cost + HANDLE_COST < grips[0].cost):
                 notes.append("no face of the part that the hand could have moved it by lies where the hand was seen: a "
                              "handle is assumed before its finger tips")
@@ -278,15 +290,21 @@ def _stroke_sign(q: np.ndarray) -> float:
     return float(np.sign(demo["q_demo_end"] - demo["q_start"]))
 
 
-def _waiting(fit: JointFit, pose: np.ndarray, grip: Grip, moving: np.ndarray, sign: float, rate: float) -> np.ndarray:
+def _waiting(shape: LinkShape, fit: JointFit, pose: np.ndarray, grip: Grip, moving: np.ndarray, sign: float,
+             rate: float) -> np.ndarray:  # fmt: skip
     """(T, 1, 3) m by which the hand is back from its grip: until the part moves it touches and does not press.
 
     The joint's own motion says when the push begins; a hand that pressed while it waited would push too early.
     """
     onset = int(np.argmax(moving)) if moving.any() else 0
+    onset = max(onset, round(ONSET * rate))  # a video that begins with the push begins with a touch all the same
     early = np.clip((onset - np.arange(len(pose))) / max(ONSET * rate, 1.0), 0.0, 1.0)
     direction = drive_direction(fit, grip.pose[TIPS].mean(0), sign)
-    return ((PRESS + 0.001) * early * early * (3 - 2 * early))[:, None, None] * (pose[:, :3, :3] @ direction)[:, None]
+    # Back by the press, and on until nothing else of the hand pushes: a grip may hold the link with more than its tips.
+    back = PRESS + 0.001
+    while back < MAX_BACK and pushing_spheres(shape, fit, sign, grip.pose - back * direction).any():
+        back += 0.001
+    return (back * early * early * (3 - 2 * early))[:, None, None] * (pose[:, :3, :3] @ direction)[:, None]
 
 
 def _assemble(shape: LinkShape, world: np.ndarray, held: np.ndarray, pose: np.ndarray, attached: np.ndarray, grip: Grip,

@@ -22,6 +22,7 @@ PRESS = 0.004  # m by which pushing tips are aimed below the surface
 RAY_STD, ACROSS_STD = 0.05, 0.025  # m, what the image says about the hand along and across the viewing ray
 TURN_STD = np.deg2rad(25.0)
 TIPS = (4, 8, 12, 16, 20)
+TOUCH = 0.001  # m of overlap from which on a sphere pushes
 HALF_HAND = 0.1  # m: a turn by an angle moves a hand's ends by so much a radian
 AGAINST = -0.55  # cosine between a pushed face's normal and the motion
 FINGER_REACH = 0.035  # m by which a finger may be bent onto the surface
@@ -105,12 +106,12 @@ def _turns(std: float) -> list[Rotation]:
     return out
 
 
-def _pushing(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray) -> np.ndarray:
+def pushing_spheres(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray) -> np.ndarray:
     """(S,) bool, spheres that overlap a face that looks against the motion."""
     x = SPHERES @ pose
     distance, normal = shape.distance(x)
     against = np.einsum("...i,...i->...", normal, drive_direction(fit, x, sign)) < AGAINST
-    return against & (distance < RADII - 0.001)
+    return against & (distance < RADII - TOUCH)
 
 
 def _slips(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, pushing: int) -> float:
@@ -118,7 +119,7 @@ def _slips(shape: LinkShape, fit: JointFit, sign: float, pose: np.ndarray, pushi
     edge a hand whose place is known to a centimetre is as likely beside the link as on it, and would not stay on it."""
     forward = drive_direction(fit, pose[list(TIPS)].mean(0), sign)
     across = np.linalg.svd(forward[None])[2][1:]
-    left = [_pushing(shape, fit, sign, pose + s * SURE * u).sum() for u in across for s in (-1, 1)]
+    left = [pushing_spheres(shape, fit, sign, pose + s * SURE * u).sum() for u in across for s in (-1, 1)]
     return sum(1.0 - min(1.0, float(n) / max(pushing, 1)) for n in left)
 
 
@@ -129,7 +130,7 @@ def _overlap_cost(deep: np.ndarray, tips: tuple[int, ...]) -> np.ndarray:
     return (np.minimum(np.maximum(deep - allowed, 0.0) / 0.004, 5.0) ** 2).sum(-1)
 
 
-def _hidden(shape: LinkShape, poses: np.ndarray, ray: np.ndarray) -> np.ndarray:
+def hidden(shape: LinkShape, poses: np.ndarray, ray: np.ndarray) -> np.ndarray:
     """(...,) how many palm landmarks lie behind the link: hands were seen, so hardly any can."""
     ahead = poses[..., list(PALM), None, :] - AHEAD[:, None] * ray
     return (shape.distance(ahead)[0] < -0.002).any(-1).sum(-1)
@@ -206,7 +207,7 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
         prior = (along / std.ray) ** 2 + (across / std.across) ** 2
         # All places with the hand as it was seen, then the promising ones turned as well.
         poses = (seen - anchor)[None] + aims[:, None]
-        rough = prior + _overlap_cost(penetration(shape, poses), tips) + OCCLUDED * _hidden(shape, poses, ray)
+        rough = prior + _overlap_cost(penetration(shape, poses), tips) + OCCLUDED * hidden(shape, poses, ray)
         near = np.unique(np.concatenate([np.argsort(rough)[:60], np.argsort(prior)[:40], [len(aims) - 1]]))
         best: list[tuple[float, int, int]] = []
         for k, turn in enumerate(turns):
@@ -217,7 +218,7 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
             # Tips that float far off the surface cannot all be bent onto it.
             off = np.maximum(shape.distance(x)[0] - 0.02, 0).sum(1) / 0.02
             cost = prior[near] + (turn.magnitude() / std.turn) ** 2 + _overlap_cost(deep, tips) + off
-            cost = cost + OCCLUDED * _hidden(shape, poses, ray)
+            cost = cost + OCCLUDED * hidden(shape, poses, ray)
             best += [(float(cost[j]), int(near[j]), k) for j in np.argsort(cost)[:4]]
         for _, j, k in sorted(best)[:10]:
             turn = turns[k]
@@ -230,18 +231,18 @@ def find_grips(shape: LinkShape, fit: JointFit, sign: float, seen: np.ndarray, r
                     penetration(shape, bent), (*tips, 4))
                 if not np.allclose(pinched[4], bent[4]) and extra < 1.0:
                     bent, kind = pinched, "pinch"
-            pushes = _pushing(shape, fit, sign, bent)
+            pushes = pushing_spheres(shape, fit, sign, bent)
             pushing = int(pushes.sum())
             wrong = _overlap_cost(penetration(shape, bent), (*tips, 4) if kind == "pinch" else tips)
             cost = prior[j] + (turn.magnitude() / std.turn) ** 2 + wrong + 4.0 * max(0, 3 - pushing) + 0.3 * g
             cost += SLIP * _slips(shape, fit, sign, bent, pushing) + IDLE * int((~pushes[list(tips)]).sum())
             bend = float(np.linalg.norm(bent[list(tips)] - pose[list(tips)], axis=1).max())
             cost += (bend / std.across) ** 2
-            hidden = int(_hidden(shape, bent, ray))
-            cost += OCCLUDED * hidden
+            behind = int(hidden(shape, bent, ray))
+            cost += OCCLUDED * behind
             if pushing:
                 shift, angle = aims[j] - anchor, float(turn.magnitude())
-                found.append((float(cost), Grip(bent, kind, shift, angle, pushing, hidden, float(cost), bend)))
+                found.append((float(cost), Grip(bent, kind, shift, angle, pushing, behind, float(cost), bend)))
     found.sort(key=lambda item: item[0])
     out: list[Grip] = []
     for _, grip in found:

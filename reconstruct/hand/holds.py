@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.geometry import Geometry, LinkMesh
-from reconstruct.hand.grip import PRESS, RADII
+from reconstruct.hand.grip import PRESS, RADII, hidden, penetration
 from reconstruct.hand.shape import LinkShape, drive_direction
 from reconstruct.joint.models import JointFit
 
@@ -22,6 +22,7 @@ Part = tuple[np.ndarray, np.ndarray]
 TIPS = (8, 12, 16)
 THICK, HEIGHT, POST, MARGIN = 0.008, 0.012, 0.008, 0.012  # m: bar along and across the motion, posts, beyond the tips
 CLEAR = 0.003  # m between finger tips and the surface that they reach behind the bar
+STEPS = np.arange(0.0, 0.201, 0.004)  # m towards the camera
 REACH = 0.08  # m, longest post: a hand farther off the part holds nothing of it
 MIN_REACH = 0.006  # m, of a post that is worth adding
 
@@ -38,24 +39,33 @@ def _box(centre: np.ndarray, axes: np.ndarray, sizes: tuple[float, float, float]
     return centre + (signs * sizes) @ axes
 
 
-def assumed_handle(shape: LinkShape, fit: JointFit, sign: float, hand: np.ndarray
+def _in_front(shape: LinkShape, hand: np.ndarray, ray: np.ndarray) -> np.ndarray | None:
+    """The hand (21, 3) moved towards the camera until it is clear of the link and none of its palm is behind it: it was
+    seen, and a single view errs along the ray. None where it would have to come too far."""
+    for step in STEPS:
+        moved = hand - step * ray
+        clear = shape.distance(moved[list(TIPS)])[0].min() >= RADII[TIPS[0]] + CLEAR
+        if clear and penetration(shape, moved).max() < CLEAR and not hidden(shape, moved, ray):
+            return moved
+    return None
+
+
+def assumed_handle(shape: LinkShape, fit: JointFit, sign: float, hand: np.ndarray, ray: np.ndarray
                    ) -> tuple[tuple[Part, ...], np.ndarray] | None:  # fmt: skip
     """A bar before the finger tips of a hand and its posts.
 
     Args:
         shape: the moving link.  fit: the joint, metric.  sign: of the drive along q.
-        hand: (21, 3) m in the link's frame, where the hand was seen.
+        hand: (21, 3) m in the link's frame, where the hand was seen.  ray: (3,) unit viewing direction there.
 
     Returns:
-        Convex parts (link frame, m), and the hand (21, 3) moved off the surface where it had sunk into it; None where
-        the tips are too far off the link.
+        Convex parts (link frame, m), and the hand (21, 3) moved towards the camera where it had sunk into the link;
+        None where it would have to be moved too far, or the tips are too far off the link.
     """
-    tips = hand[list(TIPS)]
-    distance, normal = shape.distance(tips)
-    sunk = float(np.max(RADII[TIPS[0]] + CLEAR - distance))
-    if sunk > 0:
-        hand = hand + sunk * normal[int(np.argmin(distance))]
-        tips = hand[list(TIPS)]
+    moved = _in_front(shape, hand, ray)
+    if moved is None:
+        return None
+    hand, tips = moved, moved[list(TIPS)]
     middle = tips.mean(0)
     forward = drive_direction(fit, middle, sign)
     along = tips[-1] - tips[0]

@@ -93,22 +93,31 @@ def test_a_handle_that_geometry_lacks_is_assumed_where_the_hand_pulls(tmp_path) 
     assert result.joint_progress >= 0.9 and max(result.controls.values()) < 0.05
 
 
+def gripping(scene: Scene) -> tuple[LinkShape, np.ndarray, np.ndarray]:
+    """The drawer without its handle, the true hand in its frame, and the viewing ray."""
+    fit = scene.fit
+    camera = -fit.T_camera_world[:3, :3].T @ fit.T_camera_world[:3, 3]
+    ray = scene.joints[50].mean(0) - camera
+    hand = scene.joints[50] - fit.link_pose(fit.q)[50, :3, 3]
+    return LinkShape(bare(scene.geometry).moving), hand, ray / np.linalg.norm(ray)
+
+
 def test_no_handle_is_assumed_far_from_the_part() -> None:
     scene = make_scene("drawer")
-    shape = LinkShape(bare(scene.geometry).moving)
-    grip = scene.joints[50] - scene.fit.link_pose(scene.fit.q)[50, :3, 3]
-    assert assumed_handle(shape, scene.fit, 1.0, grip) is not None
-    assert assumed_handle(shape, scene.fit, 1.0, grip + [0.0, -0.2, 0.0]) is None
+    shape, grip, ray = gripping(scene)
+    assert assumed_handle(shape, scene.fit, 1.0, grip, ray) is not None
+    assert assumed_handle(shape, scene.fit, 1.0, grip + [0.0, -0.2, 0.0], ray) is None
+    assert assumed_handle(shape, scene.fit, 1.0, grip + 0.4 * ray, ray) is None  # would have to come 40 cm nearer
 
 
-def test_a_hand_sunk_into_the_surface_is_moved_off_before_a_handle_is_put_there() -> None:
+def test_a_hand_sunk_into_the_surface_comes_towards_the_camera_before_a_handle_is_put_there() -> None:
     scene = make_scene("drawer")
-    shape = LinkShape(bare(scene.geometry).moving)
-    grip = scene.joints[50] - scene.fit.link_pose(scene.fit.q)[50, :3, 3]
-    sunk = grip - [0.0, -0.03, 0.0]
-    parts, moved = assumed_handle(shape, scene.fit, 1.0, sunk)
+    shape, grip, ray = gripping(scene)
+    sunk = grip + 0.04 * ray
+    parts, moved = assumed_handle(shape, scene.fit, 1.0, sunk, ray)
     assert shape.distance(moved[[8, 12, 16]])[0].min() >= RADII[8] > shape.distance(sunk[[8, 12, 16]])[0].min()
-    # The tips press on the bar by millimetres; no other sphere is deep in it.
+    np.testing.assert_allclose(np.cross(moved - sunk, ray), 0.0, atol=1e-12)
+    # The tips press on the bar by millimetres.
     bar = shape.with_parts(parts[:1])
     deep = np.maximum(RADII - bar.distance(SPHERES @ moved)[0], 0) - np.maximum(
         RADII - shape.distance(SPHERES @ moved)[0], 0)  # fmt: skip

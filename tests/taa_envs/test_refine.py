@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from taa_envs.corrections import DEFAULTS, NAMES, Corrections, rotations
 from taa_envs.refine import BOUND, corrected, refine, robustness, score
 from taa_envs.refined import with_reference, write_refinement
 from taa_envs.replay import replay, simulate
-from taa_envs.rollouts import Rollouts
+from taa_envs.rollouts import OutOfTime, Rollouts
 from taa_envs.scene import build_scene
 from taa_envs.simulation import HandPath
 from tests.taa_envs.made import door_arguments
@@ -161,3 +162,39 @@ def test_robustness_of_a_hand_that_misses_is_low(door: Asset) -> None:
     assert robustness(door)["worst"] > 0.8
     reference = replace(door.reference, hand_joints=door.reference.hand_joints + [2.0, 0, 0])
     assert robustness(replace(door, reference=reference))["mean"] < 1e-3
+
+
+@pytest.mark.parametrize("seconds", [20.0, 50.0])
+def test_the_wall_clock_ends_a_search_however_slow_the_machine_is(missing: Asset, monkeypatch: pytest.MonkeyPatch,
+                                                                  seconds: float) -> None:  # fmt: skip
+    """Each step of the batch takes 20 ms of a clock that only we wind: a generation takes 30 s of it."""
+    import taa_envs.refine
+    import taa_envs.rollouts
+    from taa_envs.rows import BatchRows
+
+    class Clock:
+        now = 100.0
+
+        def monotonic(self) -> float:
+            return self.now
+
+    clock, step = Clock(), BatchRows.step
+    for module in (taa_envs.refine, taa_envs.rollouts):
+        monkeypatch.setattr(module, "time", clock)
+
+    def slow(self: BatchRows, *args: object) -> None:
+        clock.now += 0.02
+        step(self, *args)
+
+    monkeypatch.setattr(BatchRows, "step", slow)
+    found = refine(missing, seconds=seconds)
+    assert found.seconds <= seconds + 1.0
+    assert (found.rollouts > 0) == (seconds > 30)
+    assert not found.changed or found.after.joint_progress > found.before.joint_progress
+
+
+def test_replays_that_are_late_are_given_up(door: Asset) -> None:
+    runs = Rollouts(build_scene(door), n=2)
+    path = HandPath(door.reference.time, door.reference.hand_joints)
+    with pytest.raises(OutOfTime):
+        runs.run([path, path], deadline=time.monotonic() - 1.0)
