@@ -115,7 +115,8 @@ class _Networks:
             size = (max(1, round(part.shape[1] * k)), max(1, round(part.shape[0] * k)))
             crop = np.zeros((PALM_SIZE, PALM_SIZE, 3), np.uint8)
             small = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
-            ox, oy = round((x0 - left) * k), round((y0 - top) * k)
+            # A square that starts within a pixel would be placed at -1.
+            ox, oy = max(0, round((x0 - left) * k)), max(0, round((y0 - top) * k))
             small = small[: PALM_SIZE - oy, : PALM_SIZE - ox]
             crop[oy : oy + small.shape[0], ox : ox + small.shape[1]] = small
         else:

@@ -101,3 +101,15 @@ def test_offline_is_one_clear_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path
         weights.from_wheel("mediapipe==0.10.21", provider.DIGESTS)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.rglob("*.tflite"))
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 360), (637, 359), (500, 281), (360, 640), (961, 541)])
+def test_palms_are_looked_for_in_pictures_of_any_size(width: int, height: int) -> None:
+    """A tile may start between two pixels."""
+    try:
+        networks = provider._Networks()
+    except TaaError as error:
+        pytest.skip(str(error))
+    image = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    for square in provider._squares(height, width):
+        assert isinstance(networks.palms(image, square), list)
