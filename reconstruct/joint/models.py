@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -59,6 +59,7 @@ class JointFit:
         image_line: (2, 2) full px.
         residual_px: median over inlier observations, full px.  inliers, tracks: counts.
         moving_frames: (T,) bool, the frames in which the part moves.
+        further: joints of other links of the same object, each on the static one, in the same world and scale.
     """
 
     verdict: str
@@ -82,6 +83,7 @@ class JointFit:
     inliers: int = 0
     tracks: int = 0
     moving_frames: np.ndarray | None = None
+    further: tuple[JointFit, ...] = ()
 
     @property
     def unit(self) -> str:
@@ -96,3 +98,22 @@ class JointFit:
         x = xyz_world @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
         x = x @ self.K.T
         return x[..., :2] / x[..., 2:]
+
+
+def placed(fit: JointFit, T_new_old: np.ndarray, factor: float = 1.0) -> JointFit:
+    """The same joint in another world, all lengths first multiplied by factor; ``further`` and uncertainties too."""
+    R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+    T = np.array(fit.T_camera_world, float)
+    T[:3, 3] *= factor
+    slide = fit.type == "prismatic"
+    std = dict(fit.std)
+    if std.get("point_m") is not None:
+        std["point_m"] = std["point_m"] * factor
+    if slide and std.get("q") is not None:
+        std["q"] = np.asarray(std["q"]) * factor
+    return replace(
+        fit, axis=R @ fit.axis, point=None if fit.point is None else factor * R @ fit.point + t,
+        pitch=None if fit.pitch is None else fit.pitch * factor, q=fit.q * factor if slide else fit.q,
+        points=None if fit.points is None else factor * fit.points @ R.T + t,
+        T_camera_world=T @ np.linalg.inv(T_new_old), std=std,
+        further=tuple(placed(other, T_new_old, factor) for other in fit.further))  # fmt: skip

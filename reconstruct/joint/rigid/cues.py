@@ -10,15 +10,15 @@ import numpy as np
 from reconstruct.cues import Tracks
 from reconstruct.depth import sample_depth
 from reconstruct.errors import TaaError
-from reconstruct.joint.models import JointFit
-from reconstruct.joint.rigid.fit import fit_rigid
+from reconstruct.joint.models import JointFit, placed
+from reconstruct.joint.rigid.several import fit_joints
 from reconstruct.joint.world import assumed_up, world_from_camera
 
 
 def fit_from_cues(tracks: Tracks, camera: Mapping[str, np.ndarray], depth: np.ndarray | None = None,
                   xyz_world: np.ndarray | None = None, moving: np.ndarray | None = None, size: tuple[int, int] = (0, 0),
                   metric: bool = True, seed: int = 0) -> JointFit:  # fmt: skip
-    """Joint from tracks with depth.
+    """Joint from tracks with depth; other links that move are its ``further``.
 
     Args:
         tracks: uv in full px.
@@ -58,7 +58,7 @@ def fit_from_cues(tracks: Tracks, camera: Mapping[str, np.ndarray], depth: np.nd
     if len(Ks) > 1:  # a zoom, or a network's own estimate a frame: every picture as the first lens would show it
         to_first = K @ np.linalg.inv(Ks)
         uv = np.einsum("tij,ntj->nti", to_first[:, :2, :2], uv) + to_first[:, :2, 2]
-    fit = fit_rigid(uv, tracks.visible, z, K, pose, link, metric, seed)
+    fit = fit_joints(uv, tracks.visible, z, K, pose, link, metric, seed)
     return fit if posed or fit.verdict == "refused" else _upright(fit)
 
 
@@ -85,7 +85,5 @@ def _upright(fit: JointFit) -> JointFit:
     up, how = assumed_up(fit.type, fit.axis, fit.points, fit.points @ T[:3, :3].T + T[:3, 3])
     origin = np.median(fit.points, axis=0) if fit.point is None else fit.point
     T_world = world_from_camera(up, fit.axis, origin)
-    R, t = T_world[:3, :3], T_world[:3, 3]
-    return replace(fit, reason=f"{fit.reason}; {how}", axis=R @ fit.axis, points=fit.points @ R.T + t,
-                   point=None if fit.point is None else R @ fit.point + t,
-                   T_camera_world=np.linalg.inv(T_world))  # fmt: skip
+    return replace(placed(fit, T_world), reason=f"{fit.reason}; {how}",
+                   further=tuple(placed(other, T_world) for other in fit.further))  # fmt: skip

@@ -102,13 +102,14 @@ def _sample(obs: Observations, count: int, rng: np.random.Generator) -> np.ndarr
     return np.concatenate(out)
 
 
-def moving_tracks(obs: Observations) -> np.ndarray:
-    """(N,) bool: tracks that no place at rest explains, by how far their pixels are from its picture."""
+def moving_tracks(obs: Observations, quantile: float = 0.8) -> np.ndarray:
+    """(N,) bool: tracks that no place at rest explains, by that quantile of how far their pixels are from its picture.
+    """
     X = robust_mean(obs.lift())
     cam = np.einsum("tij,nj->nti", obs.T_camera_world[:, :3, :3], X) + obs.T_camera_world[:, :3, 3]
     uv = cam[..., :2] / np.maximum(cam[..., 2:], 1e-6) * obs.K[[0, 1], [0, 1]] + obs.K[:2, 2]
     miss = np.linalg.norm(uv - obs.uv, axis=-1)
-    far = np.array([np.quantile(m[s], 0.8) if s.any() else 0.0 for m, s in zip(miss, obs.seen, strict=True)])
+    far = np.array([np.quantile(m[s], quantile) if s.any() else 0.0 for m, s in zip(miss, obs.seen, strict=True)])
     floor = np.median(far[far < np.median(far)]) if len(far) > 1 else 0.0
     return far > max(3.0, 3 * floor)
 

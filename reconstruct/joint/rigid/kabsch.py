@@ -128,10 +128,11 @@ def hypotheses(poses: Poses, rng: np.random.Generator, count: int = 60) -> list[
     F = len(poses.frames)
     found: list[tuple[float, Twist, np.ndarray]] = []
     amount = w * (np.sum(shift**2, 1) + size**2 * np.sum(turn**2, 1))
-    if amount.sum() <= 0:
+    few = min(3, int(np.count_nonzero(amount / amount.sum()))) if amount.sum() > 0 else 0
+    if few == 0:
         return []
     for k in range(count):
-        rows = np.arange(F) if k == 0 else rng.choice(F, min(F, 3), replace=False, p=amount / amount.sum())
+        rows = np.arange(F) if k == 0 else rng.choice(F, few, replace=False, p=amount / amount.sum())
         direction = _dominant(shift[rows], w[rows])
         twist, _ = make("prismatic", np.zeros(3), direction, centre, size)
         found.append(_judged(twist, shift @ twist.v, poses, shift, turn, w, size))
