@@ -14,6 +14,7 @@ from reconstruct.cues import HandReference, ProviderInfo
 from reconstruct.geometry import Geometry
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
+from taa_envs.checks import numbered
 
 if TYPE_CHECKING:
     from taa_envs.asset import Asset
@@ -52,6 +53,11 @@ def joint_object(fit: JointFit, index: np.ndarray | None) -> dict:
         "std": {**fit.std, **std}, "image_line": fit.image_line, "residual_px": fit.residual_px,
         "inliers": int(fit.inliers), "tracks": int(fit.tracks),
     })  # fmt: skip
+
+
+def further_objects(fit: JointFit, index: np.ndarray | None) -> dict[str, dict]:
+    """``joint_2``, ``joint_3`` ... as :func:`joint_object`; empty for an object with one joint."""
+    return {numbered("joint", k): joint_object(other, index) for k, other in enumerate(fit.further, 2)}
 
 
 def refused_joint(reason: str) -> dict:
@@ -101,6 +107,7 @@ def write_asset(root: Path, asset_id: str, video: Video, fit: JointFit, geometry
         files: further files of the folder.
     """
     from taa_envs.asset import save_asset
+    from taa_envs.mechanism import FurtherLink
 
     given = any(p.name == "given" and p.version == "scene folder" for p in providers)
     return save_asset(
@@ -114,4 +121,6 @@ def write_asset(root: Path, asset_id: str, video: Video, fit: JointFit, geometry
                 "seconds": float(video.time[-1] - video.time[0]), "cues_given": given},
         providers=[{key: value for key, value in asdict(p).items() if key != "stage" or value} for p in providers],
         notes=list(dict.fromkeys(notes)), files=dict(files or {}),
+        further=[FurtherLink(joint_object(other, video.index), link, np.asarray(other.q, float))
+                 for other, link in zip(fit.further, geometry.further, strict=True)],
     )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from reconstruct.cues import Tracks
@@ -15,8 +17,17 @@ RESTS = 0.004
 """How much a resting track may wander, as a share of the image diagonal."""
 
 
-def second_part(video: Video, tracks: Tracks, fit: JointFit) -> str | None:
-    """A sentence that names when another part moves while the fitted joint rests, or None.
+@dataclass(frozen=True)
+class OtherPart:
+    """A part that moves by itself. tracks: (M,) its tracks.  start, end: frames between which it moves."""
+
+    tracks: np.ndarray
+    start: int
+    end: int
+
+
+def second_part(video: Video, tracks: Tracks, fit: JointFit) -> OtherPart | None:
+    """The part that moves while the fitted joint rests, or None.
 
     A part's track rests, moves once, and rests again; a track on an arm or its shadow is hardly ever at
     rest. Counted are tracks outside the joint's consensus that are seen in most frames, rest for at least
@@ -28,12 +39,11 @@ def second_part(video: Video, tracks: Tracks, fit: JointFit) -> str | None:
     """
     if fit.q is None or fit.moving_frames is None or fit.point_track is None:
         return None
-    T = len(video)
     resting = ~np.asarray(fit.moving_frames, bool)
     free = np.ones(len(tracks.uv), bool)
     free[np.asarray(fit.point_track, int)] = False
     free &= tracks.visible.mean(1) >= 0.6
-    when: list[tuple[int, int]] = []
+    when: list[tuple[int, int, int]] = []
     for n in np.flatnonzero(free):
         seen = np.flatnonzero(tracks.visible[n])
         uv = np.asarray(tracks.uv[n, seen], float)
@@ -47,11 +57,16 @@ def second_part(video: Video, tracks: Tracks, fit: JointFit) -> str | None:
             continue
         start, end = seen[np.flatnonzero(at_a)[-1]], seen[np.flatnonzero(at_b)[0]]
         if start < end and resting[start : end + 1].mean() > 0.7:
-            when.append((int(start), int(end)))
+            when.append((int(n), int(start), int(end)))
     if len(when) < MIN_TRACKS:
         return None
-    start, end = (int(np.median(column)) for column in zip(*when, strict=True))
+    rows, start, end = (np.array(column) for column in zip(*when, strict=True))
+    return OtherPart(rows, int(np.median(start)), int(np.median(end)))
+
+
+def words_of(video: Video, other: OtherPart) -> str:
+    """A sentence for who has to know that only the dominant part was taken."""
     return (
-        f"another part moves from {video.time[start]:.1f} to {video.time[min(end, T - 1)]:.1f} s while this joint "
-        "rests; the dominant one was taken, trim the video to the other one to get it too"
+        f"another part moves from {video.time[other.start]:.1f} to {video.time[min(other.end, len(video) - 1)]:.1f} s "
+        "while this joint rests; the dominant one was taken, trim the video to the other one to get it too"
     )

@@ -15,7 +15,7 @@ import numpy as np
 from reconstruct import cues_io
 from reconstruct.cues import HandReference, Hands, LinkMasks, ProviderInfo, Tracks
 from reconstruct.errors import Refused, TaaError
-from reconstruct.export import joint_object, plain, refused_joint, write_asset
+from reconstruct.export import further_objects, joint_object, plain, refused_joint, write_asset
 from reconstruct.geometry import Geometry
 from reconstruct.joint.models import JointFit
 from reconstruct.store import load_stage, save_stage, stage_key
@@ -49,6 +49,7 @@ class ReconstructResult:
     Attributes:
         id: the asset's id.  asset: None where the answer is a refusal.
         joint: the contract's joint object.  replay: the contract's replay object, or None.
+        further: ``joint_2``, ``joint_3`` ... of an object with several joints.
         seconds: per stage.  notes: what a user should know.
         error: "what is wrong; what to do" of a refusal.
     """
@@ -60,11 +61,13 @@ class ReconstructResult:
     seconds: dict[str, float]
     notes: tuple[str, ...] = ()
     error: str | None = None
+    further: Mapping[str, dict] = field(default_factory=dict)
 
     def as_dict(self) -> dict:
         """The contract's object, plain types only."""
-        return plain({"id": self.id, "asset": str(self.asset.path) if self.asset else None, "joint": self.joint,
-                      "replay": self.replay, "seconds": self.seconds, "notes": list(self.notes)})  # fmt: skip
+        path = str(self.asset.path) if self.asset else None
+        return plain({"id": self.id, "asset": path, "joint": self.joint, **self.further, "replay": self.replay,
+                      "seconds": self.seconds, "notes": list(self.notes)})  # fmt: skip
 
 
 class Stopped(Exception):
@@ -205,9 +208,6 @@ def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: fl
         seen = look(video, scene, focal, seed, stages, scratch)
         if seen.fit.verdict == "refused":
             raise Refused(with_advice(seen.fit.reason))
-        if seen.fit.type == "screw":
-            raise Refused(f"the part moves as a screw ({seen.fit.pitch:.3g} m/rad), and an asset holds a hinge or a "
-                          "slide; read the joint itself with taa fit")  # fmt: skip
     except Refused as refusal:
         fit = seen.fit if seen is not None else None
         joint = joint_object(fit, video.index) if fit is not None and video is not None else refused_joint(str(refusal))
@@ -301,7 +301,8 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     from reconstruct.hand.scale import hand_scale
     from reconstruct.joint.fit import fit_joint
     from reconstruct.joint.rigid.cues import fit_from_cues
-    from reconstruct.others import second_part
+    from reconstruct.others import second_part, words_of
+    from reconstruct.several import alongside, joint_beside
 
     notes: list[str] = []
     if focal is None and camera is not None:
@@ -346,8 +347,14 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         notes.append("cues/depth.npz gives no scale: it is not metric or hardly meets the part's points")
     if camera is not None and "T_world_camera" in camera and not ranged:
         fit = cues_io.in_world_of(fit, camera)
-    if words := second_part(video, tracks, fit):
-        notes.append(words)
+    if not ranged and (other := second_part(video, tracks, plain)):
+        beside: JointFit = stages.run("joint-2", lambda: joint_beside(video, tracks, plain, other, seed),
+                                      ("joint", "others.py", "several.py"))  # fmt: skip
+        if beside.verdict == "refused":
+            notes.append(f"{words_of(video, other)} (fitted by itself: {beside.reason})")
+        else:
+            plain = replace(plain, further=(beside,))
+    fit = alongside(fit, plain)
     # A scene without metres whose joint the hand has scaled: what else it holds, meshes, is scaled alike.
     lengths = [np.median(np.linalg.norm(f.points, axis=1)) for f in (plain, fit)]
     return fit, notes, float(lengths[1] / lengths[0]) if ranged else 1.0
@@ -362,7 +369,9 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
     from reconstruct.hand.align import align_hand
     from reconstruct.hand.holds import holding
     from reconstruct.report import add_report
+    from reconstruct.several import further_geometry
     from taa_envs.asset import load_asset
+    from taa_envs.errors import AssetError
     from taa_envs.files import folder_written_whole
     from taa_envs.replay import replay
 
@@ -412,6 +421,9 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
         stages.notes.append(f"the descriptors of {stages.chosen['features']} were not used: only masks and meshes from "
                             "outside are refined with them")  # fmt: skip
     geometry = keep_clear(geometry, fit)
+    if fit.further:
+        fit, geometry = stages.run("links", lambda: further_geometry(video, hands, tracks, fit, geometry),
+                                   ("geometry", "several.py"))  # fmt: skip
     reference: HandReference = stages.run("hand", lambda: align_hand(video, hands, fit, geometry, masks), ("hand",))
     if reference.holds:
         geometry = keep_clear(holding(geometry, reference.holds), fit)
@@ -420,6 +432,10 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
         folder.write("hand", cues_io.hand_arrays(reference, hands))
         folder.write_meshes(geometry)
     notes = list(dict.fromkeys([*seen.notes, *stages.notes, *geometry.notes, *reference.notes]))
+    for k, other in enumerate(fit.further, 2):
+        turn = other.type != "prismatic"
+        notes.append(f"joint_{k}: {other.type}, {np.degrees(np.ptp(other.q)) if turn else np.ptp(other.q):.3g} "
+                     f"{'deg' if turn else 'm'}, {other.reason}; it is passive, the task is the first joint's")
     if not fit.metric:
         notes.append("no metric source; one unit of length is the moving part's median depth, taken as one metre")
     if fit.verdict == "ambiguous":
@@ -434,7 +450,20 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
                 work.parent, id, video, fit, geometry, reference, tuple(makers), notes, seen.focal_given
             )
 
-        asset = stages.run("asset", save, keep=False)
+        def save_dominant(why: AssetError) -> Asset:
+            """Without the further links, where the body does not pass the gate with them."""
+            nonlocal fit, geometry
+            notes.append(f"the further links are not in the asset: {why}")
+            fit, geometry = replace(fit, further=()), replace(geometry, further=())
+            work.mkdir(exist_ok=True)
+            return stages.run("asset", save, keep=False)
+
+        try:
+            asset = stages.run("asset", save, keep=False)
+        except AssetError as error:
+            if not fit.further:
+                raise
+            asset = save_dominant(error)
         result = stages.run("replay", lambda: replay(asset), keep=False)
         notes += [n for n in result.notes if n not in notes]
         if result.joint_progress < 0.5 and result.contact_fraction < 0.5:
@@ -445,7 +474,8 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
     if scene is not None:
         with written_whole(scene / "report.html") as partial:
             partial.write_bytes((final / "report.html").read_bytes())
-    return ReconstructResult(id, asset, joint_object(fit, video.index), result.as_dict(), stages.seconds, tuple(notes))
+    return ReconstructResult(id, asset, joint_object(fit, video.index), result.as_dict(), stages.seconds, tuple(notes),
+                             further=further_objects(fit, video.index))  # fmt: skip
 
 
 def _refine(video: Video, tracks: Tracks, fit: JointFit, geometry: Geometry, masks: LinkMasks,
@@ -510,4 +540,4 @@ def fit_scene(scene: str | Path, focal: float | None = None, seed: int = 0, prog
         hands = found if isinstance(found, Hands) and found.mask.shape[0] == len(video) else nobody
     stages = Stages(None, progress or Silent())
     fit, _, _ = _joint(video, hands, tracks, focal, camera, folder, given, seed, stages)
-    return joint_object(fit, video.index)
+    return {**joint_object(fit, video.index), **further_objects(fit, video.index)}

@@ -45,9 +45,13 @@ class LinkMesh:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Both links. provenance: name -> {"value", "origin", "std"?} for every number used."""
+    """The links. provenance: name -> {"value", "origin", "std"?} for every number used.
+
+    further: moving links beside the first, of an object with several joints.
+    """
 
     static: LinkMesh
     moving: LinkMesh
     provenance: dict = field(default_factory=dict)
     notes: tuple[str, ...] = field(default_factory=tuple)
+    further: tuple[LinkMesh, ...] = ()

@@ -7,14 +7,14 @@ from reconstruct.joint.models import joint_transform, placed
 from reconstruct.joint.rigid.several import fit_joints
 
 K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1.0]])
-OUT = np.array([0.25, 0.1, -1.0]) / np.linalg.norm([0.25, 0.1, -1.0])
+OUT = np.array([0.5, 0.2, -0.8]) / np.linalg.norm([0.5, 0.2, -0.8])
 DOWN = np.array([1.0, 0.0, 0.0])
 EARLY = np.concatenate([np.linspace(0, 1, 15), np.ones(25)])
 LATE = np.concatenate([np.zeros(18), np.linspace(0, 1, 15), np.ones(7)])
 BOTH = np.concatenate([np.zeros(5), np.sin(np.linspace(0, np.pi / 2, 30)), np.ones(5)])
 
 
-def scene(parts, static=80, wrong=0.2, px=0.7, seed=0):
+def scene(parts, static=200, wrong=0.2, px=0.7, seed=0):
     """uv, visible, depth, pose of a resting camera before a front at 1.2 m; which part each track is on (-1: wrong).
 
     parts: (kind, axis, point, q (T,), centre of the part, how many tracks).
@@ -47,7 +47,7 @@ DRAWERS = [("prismatic", OUT, None, 0.2 * EARLY, (-0.1, -0.1, 1.2), 70),
            ("prismatic", OUT, None, 0.15 * LATE, (-0.1, 0.1, 1.2), 55)]  # fmt: skip
 MIXED = [("prismatic", OUT, None, 0.2 * BOTH, (-0.2, -0.1, 1.2), 70),
          ("revolute", DOWN, np.array([0.0, 0.2, 1.2]), 0.8 * BOTH, (0.15, 0.1, 1.2), 60)]  # fmt: skip
-THREE = [*DRAWERS, ("prismatic", OUT, None, -0.1 * BOTH, (0.3, 0.1, 1.2), 40)]
+THREE = [*DRAWERS, ("prismatic", OUT, None, -0.1 * BOTH, (0.3, 0.1, 1.2), 60)]
 
 
 @pytest.mark.parametrize(("parts", "seed"), [(DRAWERS, 0), (DRAWERS, 1), (MIXED, 2), (THREE, 3)])

@@ -9,7 +9,7 @@ import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.models import JointFit
-from reconstruct.others import second_part
+from reconstruct.others import second_part, words_of
 from reconstruct.video import Video
 
 T = 90
@@ -34,8 +34,9 @@ def scene(rng: np.random.Generator, other: np.ndarray) -> tuple[Tracks, JointFit
 
 def test_a_second_drawer_is_named_with_its_time(video):
     later = np.clip((np.arange(T) - 50) / 20, 0, 1)[:, None] * [0, 60.0]
-    words = second_part(video, *scene(np.random.default_rng(0), later))
-    assert words is not None and "from 1.7 to 2.3 s" in words
+    other = second_part(video, *scene(np.random.default_rng(0), later))
+    assert other is not None and set(other.tracks) == set(range(30, 50))
+    assert "from 1.7 to 2.3 s" in words_of(video, other)
 
 
 @pytest.mark.parametrize("what", ["still", "arm", "together"])

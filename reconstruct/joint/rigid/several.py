@@ -4,8 +4,8 @@ Every link hangs on the static scene by a joint of its own. The moving tracks ar
 :func:`reconstruct.joint.rigid.fit.fit_rigid` does. What does not follow that joint is searched for tracks that move
 together: small groups of neighbours are registered as a rigid body, a joint is read off their poses, and the joint that
 the most tracks follow names the group. The group is then fitted like a first one and has to pass every refusal by
-itself. Two links that move at once can pull the first joint between them: where it explains but a part of the moving
-tracks, groups are sought among all of them, and it stays only if none has more.
+itself. Two links can pull the first joint between them: where it explains but a part of the moving tracks, groups
+are sought among all of them, and it stays if they are not two or more.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ NEAR = 0.006
 """Of the picture's diagonal: how far a track may lie, in most of its frames, from where a joint carries its point."""
 FOLLOWS = 0.7
 """Share of a track's frames in which it has to be that near."""
-MIXED, CLEARLY = 0.6, 1.1
-"""Share of the moving tracks under which the first joint may be a mixture of two; how many more another has to have."""
+MIXED = 0.6
+"""Share of the moving tracks under which the first joint may be a mixture of two."""
 LEAST_MOVED = 0.92
 """Quantile of its distances from one place by which a track moves: a twelfth of the video is enough."""
 SEEDS, NEIGHBOURS, FRAMES = 24, 10, 12
@@ -58,16 +58,12 @@ def fit_joints(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.nda
         fit = fit_rigid(uv[rows], visible[rows], depth[rows], K, T_world_camera, part, metric, seed)
         return fit if fit.verdict == "refused" else replace(fit, point_track=rows[fit.point_track], tracks=N)
 
-    found = [first] if first.verdict != "refused" else []
-    if found and first.inliers < MIXED * moving.sum():
-        group = _group(obs, world, pool, rng)
-        if len(group) >= OWN_TRACKS:
-            other = fit_group(group)
-            if other.verdict != "refused" and other.inliers > CLEARLY * first.inliers:
-                found = [other]
-    free = pool.copy()
-    for fit in found:
-        free &= ~_follows(fit, obs, world)
+    found, free = [], pool.copy()
+    if first.verdict != "refused":
+        # Its inliers are tracks that agree somewhere; those that follow it throughout are what tells.
+        follows = _follows(first, obs, world)
+        if (follows & moving).sum() >= MIXED * moving.sum():
+            found, free = [first], pool & ~follows
     while len(found) < MOST_JOINTS:
         least = max(OWN_TRACKS, OWN_SHARE * found[0].inliers) if found else OWN_TRACKS
         group = _group(obs, world, free, rng)
@@ -78,12 +74,10 @@ def fit_joints(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.nda
         if fit.verdict != "refused" and fit.inliers >= least:
             free &= ~_follows(fit, obs, world)
             found.append(fit)
-    if not found:
-        return first
+    if len(found) < 2:
+        return found[0] if found and first.verdict == "refused" else first
     if found[0] is not first:
         found.sort(key=lambda fit: -fit.inliers)
-    if len(found) == 1:
-        return found[0]
     words = f"{found[0].reason}; {len(found)} parts move, each on a joint of its own"
     return replace(found[0], reason=words, further=tuple(found[1:]))
 
@@ -95,13 +89,18 @@ def _follows(fit: JointFit, obs: Observations, world: np.ndarray) -> np.ndarray:
 
 def _near(poses: np.ndarray, obs: Observations, world: np.ndarray) -> np.ndarray:
     """(N,) bool: tracks whose pixels are near, in most frames, to one point carried by poses (T, 4, 4)."""
+    near = _miss(poses, obs, world) < NEAR * 2 * float(np.linalg.norm(obs.K[:2, 2]))
+    return (near & obs.seen).sum(1) >= FOLLOWS * np.maximum(obs.seen.sum(1), 1)
+
+
+def _miss(poses: np.ndarray, obs: Observations, world: np.ndarray) -> np.ndarray:
+    """(N, T) px between tracks and the pictures of one point each that poses (T, 4, 4) carry."""
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     X = robust_mean(np.einsum("tji,ntj->nti", R, world - t))
     moved = np.einsum("tij,nj->nti", R, X) + t
     cam = np.einsum("tij,ntj->nti", obs.T_camera_world[:, :3, :3], moved) + obs.T_camera_world[:, :3, 3]
     uv = cam[..., :2] / np.maximum(cam[..., 2:], 1e-6) * obs.K[[0, 1], [0, 1]] + obs.K[:2, 2]
-    near = np.linalg.norm(uv - obs.uv, axis=-1) < NEAR * 2 * float(np.linalg.norm(obs.K[:2, 2]))
-    return (near & obs.seen).sum(1) >= FOLLOWS * np.maximum(obs.seen.sum(1), 1)
+    return np.linalg.norm(uv - obs.uv, axis=-1)
 
 
 def _group(obs: Observations, world: np.ndarray, free: np.ndarray, rng: np.random.Generator) -> np.ndarray:
