@@ -163,8 +163,8 @@ def test_states_that_nothing_ties_to_the_rest_follow_their_neighbours():
     assert fit.type == "revolute"
     q = fit.q * np.sign(fit.q[-1])
     miss = np.abs(q - np.linspace(0, 1.0, 30))
-    assert miss[:15].max() < 0.02 and miss.max() < 0.15
-    assert fit.std["q"][-1] > 3 * fit.std["q"][10]
+    assert miss[:15].max() < 0.02 and miss.max() < 0.05
+    assert fit.std["q"][-1] > 1.5 * fit.std["q"][10]
 
 
 def test_no_motion_and_free_motion_are_refused():
@@ -202,3 +202,11 @@ def test_cues_with_points_or_depth_maps_give_the_same_joint():
     maps = np.arange(24.0).reshape(2, 3, 4)
     got = sample(maps, np.array([[[0.0, 0], [7.4, 5.2]]]), np.ones((1, 2), bool), (8, 6))
     np.testing.assert_array_equal(got, [[0.0, 23.0]])
+
+
+def test_a_motion_that_starts_and_stops_at_once_is_not_smoothed():
+    """Constant speed between two rests: nearly all second differences are nothing, two are not."""
+    q = np.clip((np.arange(40) - 8) / 20, 0, 1)
+    uv, visible, z, pose, link = tracks_of("revolute", q, px=0.5, depth=0.01, field=0.01)
+    fit = fit_rigid(uv, visible, z, K, pose, link)
+    assert np.abs(fit.q * np.sign(fit.q[-1]) - q).max() < 0.02

@@ -34,9 +34,11 @@ class State:
 def residuals(st: State, obs: Observations, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, T, 3) residuals over their noise (u, v, log depth; 0 where there is none), world and camera points."""
     poses = st.twist.poses(st.s)
-    moved = np.einsum("tij,nj->nti", poses[:, :3, :3], st.points) + poses[:, :3, 3]
-    X = np.where(obs.link[:, None, None], moved, st.points[:, None])
-    cam = np.einsum("tij,ntj->nti", obs.T_camera_world[:, :3, :3], X) + obs.T_camera_world[:, :3, 3]
+    X, cam = np.empty((*obs.seen.shape, 3)), np.empty((*obs.seen.shape, 3))
+    link, rest = obs.link, ~obs.link
+    X[link], X[rest] = _carried(st.points[link], poses), st.points[rest, None]
+    cam[link] = _carried(st.points[link], obs.T_camera_world @ poses)
+    cam[rest] = _carried(st.points[rest], obs.T_camera_world)
     z = np.maximum(cam[..., 2], 1e-6)
     r = np.zeros(X.shape)
     focal = obs.K[[0, 1], [0, 1]]
@@ -45,6 +47,12 @@ def residuals(st: State, obs: Observations, noise: Noise) -> tuple[np.ndarray, n
     r[..., :2] *= obs.seen[..., None]
     r[..., 2] *= obs.ranged
     return r, X, cam
+
+
+def _carried(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(N, T, 3) points (N, 3) under poses (T, 4, 4): one matrix product for all frames."""
+    matrix = poses[:, :3, :3].reshape(-1, 3).T
+    return (points @ matrix).reshape(len(points), len(poses), 3) + poses[:, :3, 3]
 
 
 def weigh(r: np.ndarray, obs: Observations, scale: float | None) -> tuple[np.ndarray, float]:
@@ -59,18 +67,55 @@ def weigh(r: np.ndarray, obs: Observations, scale: float | None) -> tuple[np.nda
     return obs.seen * g**2, float(np.sum(obs.seen * scale**2 * (1 - g)))
 
 
-def bending(st: State, obs: Observations) -> float:
-    """Information on a second difference of the states, from how they bend: 1 / (1.5 x the 90 % quantile)^2.
+def bending(st: State, obs: Observations) -> np.ndarray:
+    """(T - 2,) information on second differences of the states, from how those bend that tracks tie to each other.
 
     Hands move things smoothly, so that states that few tracks hold, or that none ties to the others, follow their
-    neighbours. Straight motion costs nothing, so the end points are kept. Only frames that see the link tell how it
-    moves.
+    neighbours: there the scale is 1.5 x the 90 % quantile of the second differences. Where three tracks and more are
+    seen in all three frames the tracks tell, and a hand that starts or stops at once bends sharply in few frames: the
+    scale is the root mean square there, if that is more. Straight motion costs nothing, so the end points are kept.
     """
-    seen = obs.seen[obs.link].sum(0) >= 3
-    bent = np.abs(np.diff(st.s, 2))[seen[2:] & seen[1:-1] & seen[:-2]]
-    if len(bent) < 5:
-        return loose(st.s)
-    return float(1 / max(1.5 * np.quantile(bent, 0.9), 1e-5 * np.ptp(st.s), 1e-12) ** 2)
+    seen = obs.seen[obs.link]
+    tied = (seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]).sum(0) >= 3
+    bent = np.abs(np.diff(st.s, 2))
+    if tied.sum() < 5:
+        return np.broadcast_to(loose(st.s), bent.shape)
+    least = max(1e-5 * np.ptp(st.s), 1e-12)
+    usual = max(1.5 * np.quantile(bent[tied], 0.9), least)
+    sharp = max(np.sqrt(np.mean(bent[tied] ** 2)), usual)
+    return 1 / np.where(tied, sharp, usual) ** 2
+
+
+def bridged(st: State, obs: Observations) -> State:
+    """The state with stretches of frames that no three tracks tie to each other set to go on at their common speed.
+
+    Shifting the states of a stretch and turning its points back is a valley that bends: least squares creeps along it.
+    """
+    seen = obs.seen[obs.link]
+    first = np.where(seen.any(1), seen.argmax(1), obs.seen.shape[1])
+    last = np.where(seen.any(1), obs.seen.shape[1] - 1 - seen[:, ::-1].argmax(1), -1)
+    gaps = np.arange(obs.seen.shape[1] - 1)
+    open_ = ((first[:, None] <= gaps) & (last[:, None] > gaps)).sum(0) < 3
+    s, points = st.s.copy(), st.points.copy()
+    rows = np.flatnonzero(obs.link)
+    for run in np.split(np.flatnonzero(open_), np.flatnonzero(np.diff(np.flatnonzero(open_)) > 1) + 1):
+        if len(run) == 0 or run[0] < 2 or run[-1] + 3 >= len(s):
+            continue  # nothing before or behind it: the prior alone carries on
+        a, b = int(run[0]), int(run[-1]) + 1  # last frame before, first frame behind
+        back, ahead = min(a, 3), min(len(s) - 1 - b, 3)
+        speed = ((s[a] - s[a - back]) / back + (s[b + ahead] - s[b]) / ahead) / 2
+        shift = s[a] + speed * (b - a) - s[b]
+        # The side without the anchor moves.
+        if st.anchor <= a:
+            side, move = slice(b, None), first > a
+        else:
+            side, move, shift = slice(None, a + 1), last < b, -shift
+        s[side] += shift
+        pose = st.twist.poses(np.array([-shift]))[0]
+        which = rows[move & seen.any(1)]
+        points[which] = points[which] @ pose[:3, :3].T + pose[:3, 3]
+        s[a : b + 1] = np.linspace(s[a], s[b], b - a + 1)
+    return replace(st, s=s, points=points)
 
 
 def loose(s: np.ndarray) -> float:
@@ -79,7 +124,7 @@ def loose(s: np.ndarray) -> float:
 
 
 def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iterations: int = 10,
-           stiff: float | None = None, tolerance: float = 1e-5) -> tuple[State, float]:  # fmt: skip
+           stiff: np.ndarray | float | None = None, tolerance: float = 1e-5) -> tuple[State, float]:  # fmt: skip
     """Levenberg-Marquardt with one robust kernel; returns the state and its cost (without the states' prior)."""
     stiff = loose(st.s) if stiff is None else stiff
     d = st.twist.basis().shape[1]
@@ -111,9 +156,9 @@ def refine(st: State, obs: Observations, noise: Noise, scale: float | None, iter
     return st, cost - prior(st, noise, stiff) + prior(st, noise, 0.0)
 
 
-def prior(st: State, noise: Noise, stiff: float) -> float:
+def prior(st: State, noise: Noise, stiff: np.ndarray | float) -> float:
     """What the depth errors and the bending of the states cost."""
-    return float(np.sum((st.field / noise.field) ** 2) + stiff * np.sum(np.diff(st.s, 2) ** 2))
+    return float(np.sum((st.field / noise.field) ** 2) + np.sum(stiff * np.diff(st.s, 2) ** 2))
 
 
 def points_of(st: State, obs: Observations) -> State:

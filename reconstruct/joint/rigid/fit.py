@@ -7,7 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.joint.models import JointFit
-from reconstruct.joint.rigid.bundle import CUT, State, bending, estimate_noise, points_of, refine, residuals, weigh
+from reconstruct.joint.rigid.bundle import (
+    CUT,
+    State,
+    bending,
+    bridged,
+    estimate_noise,
+    points_of,
+    refine,
+    residuals,
+    weigh,
+)
 from reconstruct.joint.rigid.evidence import weigh_types
 from reconstruct.joint.rigid.kabsch import Poses, hypotheses, register
 from reconstruct.joint.rigid.normal import OWN, covariance, normal_equations
@@ -81,6 +91,7 @@ def fit_rigid(uv: np.ndarray, visible: np.ndarray, depth: np.ndarray, K: np.ndar
     whole = _spread(best, frames, every, obs, field)
     whole, _ = refine(whole, obs, told, 3.0, iterations=3, tolerance=1e-3)
     best, kept, noise = _polish(whole, obs, told)
+    best = bridged(best, kept)
     best, _ = refine(best, kept, noise, None, iterations=5, stiff=bending(best, kept), tolerance=1e-7)
     reason = _why_not(best, obs, noise, poses, world, keys, part)
     if reason:

@@ -31,7 +31,8 @@ class Normal:
     """Normal equations with the points still in them; unknowns in the order joint, then frame by frame.
 
     Attributes:
-        joint: (d, d).  cross: (T, d, 4).  own: (T, 4, 4).  stiff: information on second differences of the states.
+        joint: (d, d).  cross: (T, d, 4).  own: (T, 4, 4).
+        stiff: (T - 2,) information on second differences of the states.
         g: (d + 4 T,).  Hpp: (N, 3, 3), gp: (N, 3) of the points.
         Lj: (N, d, 3), Lt: (N, T, 4, 3) couplings of the points with joint and frames.
     """
@@ -39,7 +40,7 @@ class Normal:
     joint: np.ndarray
     cross: np.ndarray
     own: np.ndarray
-    stiff: float
+    stiff: np.ndarray
     g: np.ndarray
     Hpp: np.ndarray
     gp: np.ndarray
@@ -62,10 +63,10 @@ class Normal:
         H[:d, d:] = self.cross.transpose(1, 0, 2).reshape(d, -1)
         H[d:, :d] = H[:d, d:].T
         H[d:, d:].reshape(T, OWN, T, OWN)[np.arange(T), :, np.arange(T)] = self.own
-        if T > 2 and self.stiff > 0:
+        if T > 2:
             D2 = np.diff(np.eye(T), 2, axis=0)
             rows = d + OWN * np.arange(T)
-            H[np.ix_(rows, rows)] += self.stiff * (D2.T @ D2)
+            H[np.ix_(rows, rows)] += D2.T @ (self.stiff[:, None] * D2)
         return H
 
     def coupling(self) -> np.ndarray:
@@ -78,7 +79,7 @@ class Normal:
         d, T = self.d, self.frames
         xj, xt = x[:d], x[d:].reshape(T, OWN)
         out_t = np.einsum("tpq,tq->tp", self.own, xt) + np.einsum("tdp,d->tp", self.cross, xj)
-        if T > 2 and self.stiff > 0:
+        if T > 2:
             bend = self.stiff * np.diff(xt[:, 0], 2)
             out_t[:-2, 0] += bend
             out_t[1:-1, 0] -= 2 * bend
@@ -102,9 +103,11 @@ class Normal:
         return np.concatenate([np.einsum("ndj,nj->d", self.Lj, y), by_frames])
 
 
-def normal_equations(st: State, obs: Observations, noise: Noise, r, X, cam, w, stiff: float) -> Normal:
+def normal_equations(st: State, obs: Observations, noise: Noise, r, X, cam, w,
+                     stiff: np.ndarray | float) -> Normal:  # fmt: skip
     """Analytic Jacobians, some tracks at a time; `stiff` is the information on second differences of the states."""
     N, T = obs.seen.shape
+    stiff = np.broadcast_to(stiff, max(T - 2, 0))
     d = st.twist.basis().shape[1]
     turn = st.twist.poses(st.s)[:, :3, :3]
     # A joint's step moves world points by a twist of each frame about the origin; so does the frame's own state.
@@ -222,7 +225,10 @@ class Reduced:
             blocks -= np.einsum("ntpj,ntqj->tpq", lt, lt, optimize=True)
             border -= np.einsum("ndj,ntpj->tdp", lj, lt, optimize=True)
             corner -= np.einsum("ndj,nej->de", lj, lj, optimize=True)
-        blocks[:, 0, 0] += n.stiff * 6
+        if T > 2:
+            blocks[:-2, 0, 0] += n.stiff
+            blocks[1:-1, 0, 0] += 4 * n.stiff
+            blocks[2:, 0, 0] += n.stiff
         diagonal = np.einsum("tpp->tp", blocks)
         blocks += (damping + 1e-9) * diagonal[:, :, None] * np.eye(OWN) + 1e-12 * np.eye(OWN)
         hold, place = divmod(fixed - d, OWN)
