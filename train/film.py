@@ -12,19 +12,18 @@ from taa_envs.asset import Asset
 from taa_envs.env import ArticulationEnv
 from taa_envs.files import written_whole
 from taa_envs.registry import max_episode_steps
-from train.evaluate import act, check
+from train.evaluate import act, check, episodes
 from train.policy import Policy, load_policy
 
 
 def _pairs(asset: Asset, policy: Policy, action: str, seed: int, height: int, every: int = 2
-           ) -> Iterator[tuple[list[np.ndarray], list[bool]]]:
-    """Pictures (policy, replay) of one randomised episode after so many steps each, the last ones to the end of both,
-    and who has succeeded."""
+           ) -> Iterator[list[np.ndarray]]:
+    """Pictures (policy, replay) of one randomised episode after so many steps each, to the end of both."""
     envs = [ArticulationEnv(asset, action=action, randomize=True, render_mode="rgb_array", height=height - height % 2)
             for _ in range(2)]
     seen = [env.reset(seed=seed)[0] for env in envs]
-    pictures, won, over = [env.render() for env in envs], [False, False], [False, False]
-    yield pictures, won
+    pictures, over = [env.render() for env in envs], [False, False]
+    yield pictures
     actions = [np.zeros(0, np.float32)] * 2
     for step in range(max_episode_steps(asset.demo["duration"])):
         for i, (env, acting) in enumerate(zip(envs, (policy, None), strict=True)):
@@ -32,12 +31,11 @@ def _pairs(asset: Asset, policy: Policy, action: str, seed: int, height: int, ev
                 continue
             if acting is None or step % acting.hold == 0:
                 actions[i] = act(acting, env, seen[i])
-            seen[i], _, over[i], _, info = env.step(actions[i])
-            won[i] = info["is_success"]
+            seen[i], _, over[i], _, _ = env.step(actions[i])
             if step % every == 0 or over[i]:
                 pictures[i] = env.render()
         if step % every == 0 or all(over):
-            yield pictures, won
+            yield pictures
         if all(over):
             break
     for env in envs:
@@ -54,7 +52,7 @@ def record(asset: Asset, policy_file: str | os.PathLike, file: Path, *, seed: in
     with written_whole(Path(file)) as partial:
         writer = None
         for episode in range(count):
-            for pictures, _ in _pairs(asset, policy, described["action"], seed + episode, height):
+            for pictures in _pairs(asset, policy, described["action"], seed + episode, height):
                 frame = np.hstack(pictures)
                 frame = np.ascontiguousarray(frame[:, :frame.shape[1] - frame.shape[1] % 2])
                 if writer is None:
@@ -77,16 +75,14 @@ def strip(asset: Asset, policy_file: str | os.PathLike, file: Path, *, seed: int
 
     policy, described = load_policy(policy_file)
     check(asset, policy, described)
-    for episode in range(seed, seed + tries):
-        frames: list[list[np.ndarray]] = []
-        ends: list[bool] = []
-        for pictures, won in _pairs(asset, policy, described["action"], episode, height, every=5):
-            frames.append(list(pictures))
-            ends = list(won)
-        if ends == [True, False]:
-            chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns).round().astype(int)]
-            picture = np.vstack([np.hstack([f[who] for f in chosen]) for who in (0, 1)])
-            with written_whole(Path(file)) as partial:
-                Image.fromarray(picture).save(partial, optimize=True)
-            return episode
-    return None
+    won, lost = (episodes(asset, acting, tries, seed=seed, action=described["action"])["success"]
+                 for acting in (policy, None))
+    wanted = np.flatnonzero(won & ~lost)
+    if not len(wanted):
+        return None
+    episode = seed + int(wanted[0])
+    frames = [list(pictures) for pictures in _pairs(asset, policy, described["action"], episode, height, every=5)]
+    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns).round().astype(int)]
+    with written_whole(Path(file)) as partial:
+        Image.fromarray(np.vstack([np.hstack([f[who] for f in chosen]) for who in (0, 1)])).save(partial, optimize=True)
+    return episode

@@ -29,6 +29,7 @@ from taa_envs.files import written_whole
 from taa_envs.registry import find_assets, get_asset, shipped_folder
 from train.config import load_config
 from train.evaluate import evaluate
+from train.film import strip
 from train.run import train
 
 
@@ -87,8 +88,8 @@ def table(entries: Sequence[Entry]) -> str:
     return "\n".join(rows)
 
 
-def page(entries: Sequence[Entry], command: str, figure: str | None) -> str:
-    """Markdown page around the table."""
+def page(entries: Sequence[Entry], command: str, figure: str | None, film: tuple[str, str, int] | None = None) -> str:
+    """Markdown page around the table. film: a strip's picture, the asset in it and the episode's seed."""
     run = entries[0].runs[0]
     lines = ["# Policy zoo", "",
              f"`{command}` trains and evaluates all of it (settings: `train/configs`). Success in {run['episodes']} "
@@ -101,6 +102,10 @@ def page(entries: Sequence[Entry], command: str, figure: str | None) -> str:
                   "*Lines: with the noise that training explores with, over 100 episodes (each counted once all that "
                   "began with it have ended). Dots: evaluations without noise, the last of which ends the training "
                   "when it is perfect; its episodes are not those of the table. Dashed: the replay.*", ""]
+    if film is not None:
+        lines += [f"![Two rows of five moments of one episode.]({film[0]})", "",
+                  f"*`{film[1]}`, one drawn episode (seed {film[2]}): the policy above, the open-loop replay below, "
+                  f"which fails in it. `taa evaluate {film[1]} POLICY --video FILE` films more.*", ""]
     return "\n".join(lines)
 
 
@@ -163,15 +168,23 @@ def main(argv: Sequence[str] | None = None) -> None:
             if arguments.page is not None:
                 write_page(arguments.page, [e for e in entries if e.runs], command)
     print(table(entries))
+    if arguments.page is not None:
+        most = max(entries, key=lambda e: e.pooled("policy")[0] - e.pooled("replay")[0])
+        picture = arguments.page.parent / "images" / "zoo_policy.png"
+        gain = most.pooled("policy")[0] - most.pooled("replay")[0]
+        run = arguments.out / f"{most.asset.id}-{arguments.algo}-{arguments.seeds[0]}"
+        shown = strip(most.asset, run, picture) if gain >= 0.1 else None
+        if shown is not None:
+            write_page(arguments.page, entries, command, ("images/zoo_policy.png", most.asset.id, shown))
 
 
-def write_page(file: Path, entries: Sequence[Entry], command: str) -> None:
+def write_page(file: Path, entries: Sequence[Entry], command: str, film: tuple[str, str, int] | None = None) -> None:
     """The page and its figure, ``images/zoo.png`` beside it."""
     figure = file.parent / "images" / "zoo.png"
     figure.parent.mkdir(parents=True, exist_ok=True)
     draw(figure, entries)
     with written_whole(file) as partial:
-        partial.write_text(page(entries, command, "images/zoo.png"), encoding="utf-8")
+        partial.write_text(page(entries, command, "images/zoo.png", film), encoding="utf-8")
 
 
 if __name__ == "__main__":

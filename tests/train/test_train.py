@@ -247,10 +247,11 @@ def test_a_strip_shows_where_the_policy_wins(door: Asset, tmp_path: Path, monkey
 
     train(door, Config(**{**PPO.as_dict(), "steps": 256}), tmp_path / "run")
     picture = np.zeros((20, 30, 3), np.uint8)
-    ends = {7: [True, True], 8: [False, False], 9: [True, False]}
-    monkeypatch.setattr(film, "_pairs", lambda asset, policy, action, seed, *_, **__: iter(
-        [([picture] * 2, [False, False])] * 8 + [([picture] * 2, ends[seed])]))
+    monkeypatch.setattr(film, "_pairs", lambda *_, **__: iter([[picture, picture]] * 8))
+    wins = {True: [True, False, True, True], False: [True, False, False, False]}  # of the policy, of the replay
+    monkeypatch.setattr(film, "episodes", lambda asset, policy, count, **_: {
+        "success": np.array(wins[policy is not None][:count])})
     assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=2) is None
     assert not (tmp_path / "a.png").exists()
-    assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=3) == 9
+    assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=4) == 9
     assert Image.open(tmp_path / "a.png").size == (5 * 30, 2 * 20)
