@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 TIMESTEP = 0.002  # s
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)  # in one environment step
 MOVING_BIT, STATIC_BIT = 1 << 1, 1 << 2
-FLOOR_GAP = 0.01  # m between the lowest point of either link and the floor
+FLOOR_GAP = 0.01  # m between the lowest point of either link, or of the hand that drives it, and the floor
 
 
 @dataclass(frozen=True)
@@ -229,6 +229,8 @@ def build_spec(asset: Asset, hand: Hand | None, *, touch_static: bool = False) -
     option.impratio = 5.0  # stiffer friction than normal force: a pinch holds instead of creeping
 
     lowest = swept[0, 2]
+    if (driven := asset.reference.contact).any():  # what hangs on a wall is opened from below
+        lowest = min(lowest, float(asset.reference.hand_joints[driven][..., 2].min()) - FLOOR_GAP)
     if asset.camera is not None:  # a floor above the video's camera would hide everything from it
         T = np.array(asset.camera["T_camera_world"], float)
         lowest = min(lowest, float((-T[:3, :3].T @ T[:3, 3])[2]) - 0.1 * size)

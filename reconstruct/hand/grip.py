@@ -28,7 +28,7 @@ AGAINST = -0.55  # cosine between a pushed face's normal and the motion
 FINGER_REACH = 0.035  # m by which a finger may be bent onto the surface
 OCCLUDED = 9.0  # cost of each palm landmark that the link would hide from the camera
 PALM = (0, 2, 5, 9, 13, 17)
-AHEAD = np.array([0.01, 0.025, 0.045, 0.07, 0.1, 0.15])  # m towards the camera
+COVER = 0.004  # m of a part between a landmark and the camera that hide it
 SURE = 0.008  # m
 IDLE = 2.0  # cost of each tip of the group that does not push
 SLIP = 2.0  # cost of each direction in which all of the push would be lost
@@ -132,8 +132,7 @@ def _overlap_cost(deep: np.ndarray, tips: tuple[int, ...]) -> np.ndarray:
 
 def hidden(shape: LinkShape, poses: np.ndarray, ray: np.ndarray) -> np.ndarray:
     """(...,) how many palm landmarks lie behind the link: hands were seen, so hardly any can."""
-    ahead = poses[..., list(PALM), None, :] - AHEAD[:, None] * ray
-    return (shape.distance(ahead)[0] < -0.002).any(-1).sum(-1)
+    return (shape.thickness(poses[..., list(PALM), :], -ray) > COVER).sum(-1)
 
 
 def _bend(shape: LinkShape, pose: np.ndarray, tips: tuple[int, ...], points: np.ndarray, normals: np.ndarray

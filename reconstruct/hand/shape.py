@@ -55,6 +55,20 @@ class LinkShape:
         own = self.link.parts or ((self.link.vertices, self.link.faces),)
         return LinkShape(replace(self.link, parts=(*own, *parts)))
 
+    def thickness(self, x: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """m (...,) of the thickest part that a ray from x (..., 3) along a unit direction (3,) passes through."""
+        flat = np.asarray(x, float).reshape(-1, 3)
+        best = np.zeros(len(flat))
+        for planes in self.planes:
+            height, rate = flat @ planes[:, :3].T + planes[:, 3], planes[:, :3] @ direction
+            with np.errstate(divide="ignore", invalid="ignore"):
+                meets = -height / rate
+            into = np.where(rate < -1e-9, meets, 0.0).max(1)
+            out = np.where(rate > 1e-9, meets, np.inf).min(1)
+            beside = ((np.abs(rate) <= 1e-9) & (height > 0)).any(1)
+            best = np.maximum(best, np.where(beside, 0.0, out - np.maximum(into, 0.0)))
+        return best.reshape(x.shape[:-1])
+
     def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distance (...,) m, negative inside, and outward normal (..., 3) at x (..., 3)."""
         flat = np.asarray(x, float).reshape(-1, 3)

@@ -165,6 +165,16 @@ def test_distance_to_a_box() -> None:
     assert shape.distance(shape.centre + [0.0, 0.0, 5.0])[0] > 4.0
 
 
+def test_thickness_along_a_ray() -> None:
+    """A ray square to the drawer's front meets its 17 mm; beside it, or looking away, nothing."""
+    shape = LinkShape(make_scene("drawer").geometry.moving)
+    x = np.array([[0.15, -0.5, 0.20], [0.15, -0.5, 0.9], [0.15, -0.01, 0.20], [0.15, 2.0, 0.20]])
+    along = shape.thickness(x, np.array([0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(along[[1, 3]], 0.0)
+    assert along[0] > 0.015 and along[2] > 0.005
+    np.testing.assert_allclose(shape.thickness(x[:1], np.array([0.0, -1.0, 0.0])), 0.0)
+
+
 def test_runs_and_gaps() -> None:
     flags = np.array([0, 1, 1, 0, 1, 0, 0, 0, 1], bool)
     assert runs(flags) == [(1, 3), (4, 5), (8, 9)]
