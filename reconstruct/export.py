@@ -89,6 +89,11 @@ def number_origins(video: Video, fit: JointFit, geometry: Geometry, focal_given:
     for name, std in (reference.std if reference is not None else {}).items():
         made[f"hand.{name}"] = {"value": 0.0, "unit": units.get(name, "m"), "origin": "fitted", "std": std,
                                 "note": "correction of the demonstrated hand; reference.npz holds it at 0"}
+    if reference is not None and {"depth", "across"} <= reference.std.keys():
+        # One number for a shift in any direction, what domain randomisation draws: along the ray and twice across it.
+        offset = float(np.sqrt(reference.std["depth"] ** 2 + 2 * reference.std["across"] ** 2))
+        made["hand.offset"] = {"value": 0.0, "unit": "m", "origin": "fitted", "std": offset,
+                               "note": "length of the demonstrated hand's unknown shift against the object"}
     return plain({**made, **geometry.provenance})
 
 

@@ -170,6 +170,9 @@ def test_the_report_is_one_file_with_playable_films_and_every_number(demo, tmp_p
     text = " ".join(page.text)
     for name, number in asset.provenance.items():
         assert name in text and number["origin"] in text
+    # What randomisation shifts the hand by holds what is not known along the ray and across it.
+    std = {name: asset.provenance[f"hand.{name}"]["std"] for name in ("offset", "depth", "across")}
+    assert std["offset"] > max(std["depth"], std["across"]) > 0
     picture = cv2.imread(str(asset.path / "preview.png"))
     assert picture is not None and picture.std() > 20
 
