@@ -8,10 +8,11 @@ still brings no answer in time, it is wrapped after all.
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from taa_envs.arrays import read_npz
 SECONDS = 120.0
 FIRST_SHARE = 0.5
 """Of the time, for the exact union; the rest is for the wrapped surface."""
+CLOCK = 5.0
+"""A limit in processor seconds is one of this many seconds by the clock: a busy machine is no reason to refuse."""
 COARSE = 2e-3
 """Detail, in parts of the mesh's diagonal, that collision parts do without: the decomposition's time grows with it."""
 
@@ -51,18 +54,17 @@ def bounded_solid(vertices: np.ndarray, faces: np.ndarray, seconds: float = SECO
 
     Args:
         vertices, faces: (V, 3) finite, (F, 3) within the vertices.
-        seconds: after which to give up.
+        seconds: of processor time after which to give up.
 
     Raises:
         TaaError: there is no answer in that time, or none at all.
     """
-    begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="taa-parts-") as folder:
         asked, answer = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
         np.savez(asked, vertices=vertices, faces=faces)
         why = _ask(asked, answer, False, FIRST_SHARE * seconds)
         if why:
-            why = _ask(asked, answer, True, seconds - (time.monotonic() - begin))
+            why = _ask(asked, answer, True, (1 - FIRST_SHARE) * seconds)
         if why:
             raise TaaError(f"the mesh {why}; give a closed surface that does not cut through itself")
         arrays = read_npz(answer)
@@ -75,14 +77,16 @@ def _ask(asked: Path, answer: Path, wrapped: bool, seconds: float) -> str:
     """Run :func:`main` in a process of its own; "" when it answered, else why not."""
     try:
         done = subprocess.run(
-            [sys.executable, "-m", __name__, str(asked), str(answer), "wrap" if wrapped else "unite"],
+            [sys.executable, "-m", __name__, str(asked), str(answer), "wrap" if wrapped else "unite", f"{seconds:g}"],
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=max(seconds, 0.01),
+            timeout=max(CLOCK * seconds, 0.01),
             cwd=Path(__file__).resolve().parents[2],
         )
     except subprocess.TimeoutExpired:
+        return "was not cut into convex parts in time"
+    if done.returncode < 0 and -done.returncode == getattr(signal, "SIGXCPU", None):
         return "was not cut into convex parts in time"
     if done.returncode or not answer.is_file():
         last = (done.stderr.strip().splitlines() or ["it ended without a word"])[-1][:120]
@@ -115,7 +119,12 @@ def make_solid(vertices: np.ndarray, faces: np.ndarray, wrapped: bool) -> GivenS
     return GivenSolid(*closed, parts, len(union.pieces) if union is not None else 1, union is None)
 
 
-def main(asked: str, answer: str, how: str) -> None:
+def main(asked: str, answer: str, how: str, seconds: str) -> None:
+    with contextlib.suppress(ImportError):  # not everywhere; the caller's clock runs anyway
+        import resource
+
+        limit = max(1, int(np.ceil(float(seconds))))
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
     given = read_npz(Path(asked))
     solid = make_solid(given["vertices"], given["faces"], how == "wrap")
     parts = {f"part_{k}{i}": value for i, part in enumerate(solid.parts) for k, value in zip("vf", part, strict=True)}
