@@ -20,7 +20,7 @@ from reconstruct.container import MAX_SIDE, MIN_SIDE
 from reconstruct.cues import HandReference, Hands, HandTrack, LinkMasks, ProviderInfo, Tracks
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
-from reconstruct.joint.models import JointFit
+from reconstruct.joint.models import JointFit, placed_std
 from reconstruct.store import file_digest, save_npz
 from reconstruct.video import WORK_LONG_SIDE, Video
 from taa_envs.arrays import ArrayFileError, read_npz
@@ -439,6 +439,7 @@ def in_world_of(fit: JointFit, camera: Arrays) -> JointFit:
         point=None if fit.point is None else R @ fit.point + t,
         points=None if fit.points is None else fit.points @ R.T + t,
         T_camera_world=np.linalg.inv(T_world_camera),
+        std=placed_std(fit.std, R, 1.0, False),
     )
 
 

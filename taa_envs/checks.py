@@ -414,5 +414,5 @@ def _check_compiled_joint(model: Any, path: Path, link: int, joint: Mapping) -> 
             int(model.jnt_bodyid[advance.id]) != body.id
             or int(model.eq_type[ties[0]]) != int(mujoco.mjtEq.mjEQ_JOINT)):
         raise AssetError(f"{path}: {advance.name} must be a slide of {body.name!r} tied to {found.name} by an equality")
-    if np.abs(model.eq_data[ties[0], :5] - [0.0, joint["pitch"], 0.0, 0.0, 0.0]).max() > 1e-6 * abs(joint["pitch"]):
+    if np.abs(model.eq_data[ties[0], :5] - [0.0, joint["pitch"], 0.0, 0.0, 0.0]).max() > 1e-4 * abs(joint["pitch"]):
         raise AssetError(f"{path}: {advance.name} does not advance by asset.json's pitch")

@@ -120,16 +120,43 @@ def nominal(asset: Asset, model_axis: np.ndarray, model_point: np.ndarray) -> Dr
     return Draw(np.array(model_axis, float), np.array(model_point, float), hand=np.zeros(3))
 
 
-def draw(rng: np.random.Generator, std: Mapping[str, float], axis: np.ndarray, point: np.ndarray) -> Draw:
+def covariance(asset: Asset) -> np.ndarray | None:
+    """(6, 6) covariance of axis (rad) and point (m) that the asset's joint states, None where it states none."""
+    try:
+        C = np.array((asset.joint.get("std") or {}).get("covariance"), float)
+    except (TypeError, ValueError):
+        return None
+    if C.shape not in ((3, 3), (6, 6)) or not np.isfinite(C).all():
+        return None
+    return np.pad(C, (0, 6 - len(C)))
+
+
+def _together(joint: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """(4, 4) root of how tilt and shift across the axis err together, each of unit total variance."""
+    B = np.kron(np.eye(2), across)  # (4, 6)
+    C = B @ joint @ B.T
+    size = np.repeat([np.sqrt(max(np.trace(C[k:k + 2, k:k + 2]), 0.0)) for k in (0, 2)], 2)
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh((C + C.T) / 2 / np.outer(size, size))
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def draw(rng: np.random.Generator, std: Mapping[str, float], axis: np.ndarray, point: np.ndarray,
+         joint: np.ndarray | None = None) -> Draw:
     """One draw about a joint's axis (3,) and point (3,) m with the standard deviations of :func:`chosen`.
 
     The generator is asked for the same numbers whatever the standard deviations are.
+
+    Args:
+        joint: (6, 6) covariance of axis and point: in which directions they err, and how together. The amounts remain
+            those of std. Without it all directions across the axis are alike, and tilt and shift are independent.
     """
     normal = rng.standard_normal(14)
     across = np.linalg.svd(axis[None])[2][1:]  # (2, 3)
     # Two directions share the angle's variance, and the shift's.
-    tilt = (normal[:2] @ across) * std.get("axis", 0.0) / np.sqrt(2)
-    shift = (normal[2:4] @ across) * std.get("point", 0.0) / np.sqrt(2)
+    unit = normal[:4] / np.sqrt(2) if joint is None else _together(joint, across) @ normal[:4]
+    tilt = (unit[:2] @ across) * std.get("axis", 0.0)
+    shift = (unit[2:] @ across) * std.get("point", 0.0)
     angle = float(np.linalg.norm(tilt))
     turned = axis if angle == 0.0 else np.cos(angle) * axis + np.sin(angle) * tilt / angle
     factor = {name: float(np.exp(std.get(name, 0.0) * normal[4 + i])) for i, name in enumerate(_FACTORS)}

@@ -74,6 +74,7 @@ class Task:
         self.range = tuple(model.jnt_range[joint.id])
         self._fields = randomize.FIELDS
         self._before = {name: getattr(model, name).copy() for name in self._fields + randomize.SPRING_FIELDS}
+        self._covariance = randomize.covariance(self.asset)
         self._nominal = randomize.nominal(self.asset, model.jnt_axis[joint.id], model.jnt_pos[joint.id])
         self._draws = [self._nominal] * self.n
         n, frames = self.n, len(self._times)
@@ -170,7 +171,9 @@ class Task:
         if not low <= q0 <= high:
             raise ValueError(f"q0 must lie in the joint's range [{low:.4g}, {high:.4g}] {self.asset.unit}, is {q0:.4g}")
         amounts = randomize.chosen(self.asset, options.get("randomize", randomized))
-        made = randomize.draw(rng, amounts, self._nominal.axis, self._nominal.point) if amounts else self._nominal
+        made = self._nominal
+        if amounts:
+            made = randomize.draw(rng, amounts, made.axis, made.point, self._covariance)
         self._place(row, made, time, q0)
         return made.as_dict() if amounts else {}
 

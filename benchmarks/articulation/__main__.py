@@ -104,7 +104,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="JSON lines, one a case; appended to")
     parser.add_argument("--table", type=Path, help="print the table of such a file and stop")
     parser.add_argument("--scaling", type=Path, help="measure the fit's cost over tracks and frames, draw it, and stop")
+    parser.add_argument("--calibration", type=int, metavar="N", help="N hard cases: stated type probability against "
+                        "how often it is right (rows into --out), and stop")
     args = parser.parse_args(argv)
+    if args.calibration:
+        from benchmarks.articulation.calibration import calibration, reliability
+
+        print(reliability(calibration(args.calibration, args.out or Path("calibration.jsonl"))))
+        return 0
     if args.scaling:
         from benchmarks.articulation.scaling import scaling
 

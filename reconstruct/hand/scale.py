@@ -10,7 +10,7 @@ from reconstruct.cues import Hands
 from reconstruct.hand.drive import find_drive
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.skeleton import CONTACT, HAND_SIZE_STD
-from reconstruct.joint.models import JointFit
+from reconstruct.joint.models import JointFit, placed_std
 
 MIN_FRAMES = 3
 TOUCH_STD = 0.03  # relative, depth of what a hand touches over that of the tracked points beside it
@@ -23,12 +23,10 @@ def rescale(fit: JointFit, factor: float, factor_std: float, source: str) -> Joi
     """
     T = fit.T_camera_world.copy()
     T[:3, 3] *= factor
-    std = dict(fit.std)
     slide = fit.type == "prismatic"
-    if std.get("point_m") is not None:
-        std["point_m"] = std["point_m"] * factor
+    std = placed_std(fit.std, np.eye(3), factor, slide)
     if slide and std.get("q") is not None and fit.q is not None:
-        std["q"] = np.hypot(np.asarray(std["q"]) * factor, np.abs(fit.q) * factor * factor_std)
+        std["q"] = np.hypot(std["q"], np.abs(fit.q) * factor * factor_std)
     std["scale"] = factor_std
     return replace(
         fit, q=fit.q * factor if slide else fit.q, point=None if fit.point is None else fit.point * factor,

@@ -55,7 +55,8 @@ class JointFit:
         points: (M, 3) moving link's points at q = 0, world.
         point_track: (M,) index of each point's track in Tracks.
         metric, scale_source: as in the contract; lengths are in units of the median depth otherwise.
-        std: {"axis_deg", "point_m", "q": (T,)}.
+        std: {"axis_deg", "point_m", "q": (T,)}; with depth also "covariance", (6, 6) of the axis (rad, across it) and
+            the point on it or (3, 3) of a slide's axis, and "covariance_q", (6, T) or (3, T) of these with q.
         image_line: (2, 2) full px.
         residual_px: median over inlier observations, full px.  inliers, tracks: counts.
         moving_frames: (T,) bool, the frames in which the part moves.
@@ -106,14 +107,24 @@ def placed(fit: JointFit, T_new_old: np.ndarray, factor: float = 1.0) -> JointFi
     T = np.array(fit.T_camera_world, float)
     T[:3, 3] *= factor
     slide = fit.type == "prismatic"
-    std = dict(fit.std)
-    if std.get("point_m") is not None:
-        std["point_m"] = std["point_m"] * factor
-    if slide and std.get("q") is not None:
-        std["q"] = np.asarray(std["q"]) * factor
     return replace(
         fit, axis=R @ fit.axis, point=None if fit.point is None else factor * R @ fit.point + t,
         pitch=None if fit.pitch is None else fit.pitch * factor, q=fit.q * factor if slide else fit.q,
         points=None if fit.points is None else factor * fit.points @ R.T + t,
-        T_camera_world=T @ np.linalg.inv(T_new_old), std=std,
+        T_camera_world=T @ np.linalg.inv(T_new_old), std=placed_std(fit.std, R, factor, slide),
         further=tuple(placed(other, T_new_old, factor) for other in fit.further))  # fmt: skip
+
+
+def placed_std(std: dict, R: np.ndarray, factor: float, slide: bool) -> dict:
+    """Uncertainties of a joint whose world is turned by R (3, 3) after all lengths grew by factor; a copy."""
+    out = dict(std)
+    if out.get("point_m") is not None:
+        out["point_m"] = out["point_m"] * factor
+    along = factor if slide else 1.0
+    if out.get("q") is not None:
+        out["q"] = np.asarray(out["q"]) * along
+    if out.get("covariance") is not None:
+        C = np.asarray(out["covariance"], float)
+        G = np.kron(np.diag([1.0, factor]), R)[: len(C), : len(C)]
+        out["covariance"], out["covariance_q"] = G @ C @ G.T, along * G @ np.asarray(out["covariance_q"], float)
+    return out

@@ -210,3 +210,34 @@ def test_a_motion_that_starts_and_stops_at_once_is_not_smoothed():
     uv, visible, z, pose, link = tracks_of("revolute", q, px=0.5, depth=0.01, field=0.01)
     fit = fit_rigid(uv, visible, z, K, pose, link)
     assert np.abs(fit.q * np.sign(fit.q[-1]) - q).max() < 0.02
+
+
+def test_covariance_is_that_of_many_draws():
+    """Axis and point of fits to new noise scatter as one fit's covariance says, also together with the last state."""
+    draws = []
+    for seed in range(12):
+        uv, visible, z, pose, link = tracks_of("revolute", STROKE, moving=40, static=20, px=0.7, depth=0.005, seed=0)
+        rng = np.random.default_rng(seed)
+        fit = fit_rigid(uv + rng.normal(scale=0.7, size=uv.shape), visible, z, K, pose, link)
+        sign = np.sign(fit.axis @ AXIS)
+        point = fit.point + fit.axis * ((POINT - fit.point) @ fit.axis)
+        draws.append(np.concatenate([sign * fit.axis, point, [sign * fit.q[-1]]]))
+    C, with_q = fit.std["covariance"], fit.std["covariance_q"]
+    assert C.shape == (6, 6) and with_q.shape == (6, len(STROKE))
+    assert np.linalg.eigvalsh(C).min() > -1e-6 * np.linalg.eigvalsh(C).max()
+    assert np.degrees(np.sqrt(np.trace(C[:3, :3]))) == pytest.approx(fit.std["axis_deg"])
+    assert np.abs(fit.axis @ C[:3, :3] @ fit.axis) < 1e-6 * np.trace(C[:3, :3])  # an axis errs across itself
+    scatter = np.cov(np.array(draws)[:, :3].T)
+    assert 0.1 < np.trace(scatter) / np.trace(C[:3, :3]) < 2.0
+    # No correlation beyond one.
+    spread = np.sqrt(np.maximum(np.diag(C), 0))[:, None] * fit.std["q"]
+    assert (np.abs(with_q) <= 1.05 * spread + 1e-12).all()
+
+
+def test_a_lid_that_turns_more_than_once_is_a_screw():
+    q = np.radians(420) * np.clip((np.arange(40) - 3) / 34, 0, 1)
+    uv, visible, z, pose, link = tracks_of("screw", q, pitch=0.012, px=0.5, depth=0.005, field=0.005)
+    fit = fit_rigid(uv, visible, z, K, pose, link)
+    assert fit.type == "screw" and abs(fit.pitch) == pytest.approx(0.012, rel=0.05)
+    assert np.ptp(fit.q) == pytest.approx(np.radians(420), rel=0.01) and angle(fit.axis, AXIS) < 0.5
+    assert abs(abs(fit.pitch) - 0.012) < 4 * fit.std["pitch"]

@@ -106,3 +106,30 @@ def test_fitted_springs_are_drawn_and_taken_back(door: Asset) -> None:
     np.testing.assert_allclose(a[0], b[0][0], rtol=0, atol=1e-10)
     single.reset(options={"randomize": False})
     assert (model.dof_armature[dof], model.qpos_spring[qpos]) == before
+
+
+def test_axis_and_point_err_together_where_the_asset_says_how() -> None:
+    """A hinge seen from the front: its tilt and its shift are one and the same error."""
+    axis, point = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    lever = np.zeros((6, 1))
+    lever[0], lever[3] = 0.01, 0.005  # tilts towards x and shifts along x at once
+    joint = lever @ lever.T + 1e-8 * np.eye(6)
+    rng = np.random.default_rng(0)
+    draws = [randomize.draw(rng, {"axis": 0.01, "point": 0.005}, axis, point, joint) for _ in range(4000)]
+    tilt, shift = np.array([d.axis for d in draws])[:, :2], np.array([d.point for d in draws])[:, :2]
+    assert np.corrcoef(tilt[:, 0], shift[:, 0])[0, 1] > 0.99
+    assert np.sqrt((tilt**2).sum(1).mean()) == pytest.approx(0.01, rel=0.05)
+    assert np.sqrt((shift**2).sum(1).mean()) == pytest.approx(0.005, rel=0.05)
+    assert tilt[:, 1].std() < 0.1 * tilt[:, 0].std()
+
+
+def test_a_stated_covariance_is_used_and_a_broken_one_is_not(door: Asset) -> None:
+    C = np.diag([1e-4, 1e-4, 0, 4e-6, 4e-6, 0])
+    std = {"axis_deg": 1.0, "point_m": 0.002}
+    stated = dataclasses.replace(door, joint={**door.joint, "std": {**std, "covariance": C.tolist()}})
+    assert np.array_equal(randomize.covariance(stated), C)
+    for broken in (None, [[1.0]], "much", [[None] * 6] * 6):
+        other = dataclasses.replace(door, joint={**door.joint, "std": {**std, "covariance": broken}})
+        assert randomize.covariance(other) is None
+    with_it, without = (ArticulationEnv(a).reset(seed=3, options={"randomize": ["axis"]})[1] for a in (stated, door))
+    assert not np.array_equal(with_it["randomized"]["axis"], without["randomized"]["axis"])

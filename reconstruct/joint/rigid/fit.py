@@ -302,17 +302,19 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
     centre = np.median(points, axis=0)
     J, axis, point, pitch, rate = _derivatives(st, centre)
     q = rate * (st.s - st.s[0])
-    axis_cov = J["axis"] @ cov_joint @ J["axis"].T
-    point_cov = None if point is None else J["point"] @ cov_joint @ J["point"].T
+    place = J["axis"] if point is None else np.concatenate([J["axis"], J["point"]])
+    joint_cov = place @ cov_joint @ place.T
     # q_t = rate (s_t - s_0), and the rate changes with the joint.
     grown = np.outer(st.s - st.s[0], J["rate"])
     q_var = np.einsum("td,de,te->t", grown, cov_joint, grown) + rate**2 * (cov_states @ [1.0, 1.0, -2.0])
     q_var += 2 * rate * np.einsum("td,dt->t", grown, cov_mixed - cov_mixed[:, :1])
+    with_q = place @ (cov_joint @ grown.T + rate * (cov_mixed - cov_mixed[:, :1]))
     wider = correlation(r, w > 0)
-    axis_cov, q_std = wider * axis_cov, np.sqrt(np.maximum(wider * q_var, 0))
-    point_cov = None if point_cov is None else wider * point_cov
+    joint_cov, with_q, q_std = wider * joint_cov, wider * with_q, np.sqrt(np.maximum(wider * q_var, 0))
     if q[int(np.argmax(np.abs(q)))] < 0:
-        q, axis, pitch = -q, -axis, pitch
+        q, axis = -q, -axis
+        turned = np.repeat([-1.0, 1.0], 3)[: len(joint_cov)]
+        joint_cov, with_q = turned[:, None] * joint_cov * turned, -turned[:, None] * with_q
     kind = st.twist.kind
     p = probability[kind]
     inliers = int(link.sum())
@@ -322,8 +324,11 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
         verdict = "ambiguous"
         reason = (f"{names[0]} and {names[1]} explain the motion almost equally well (p = {p:.2f}); "
                   "a larger motion would tell")  # fmt: skip
-    std = {"axis_deg": float(np.degrees(np.sqrt(np.trace(axis_cov)))),
-           "point_m": 0.0 if point_cov is None else float(np.sqrt(np.trace(point_cov))), "q": q_std}  # fmt: skip
+    variance = np.maximum(np.diag(joint_cov), 0.0)
+    std = {"axis_deg": float(np.degrees(np.sqrt(variance[:3].sum()))), "point_m": float(np.sqrt(variance[3:].sum())),
+           "q": q_std, "covariance": joint_cov, "covariance_q": with_q}  # fmt: skip
+    if kind == "screw":
+        std["pitch"] = float(np.sqrt(max(wider * J["pitch"] @ cov_joint @ J["pitch"], 0.0)))
     px = np.linalg.norm(r[..., :2], axis=-1)[w > 0] * noise.px
     T_camera_world = obs.T_camera_world[0]
     fit = JointFit(verdict, reason, kind, probability, axis, point, pitch, q, np.arange(T), obs.K, T_camera_world,
@@ -349,7 +354,8 @@ def _derivatives(st: State, centre: np.ndarray):
     h = 1e-6
     pairs = [(of(h * e), of(-h * e)) for e in np.eye(d)]
     slope = lambda k: np.stack([(np.asarray(a[k]) - np.asarray(b[k])) / (2 * h) for a, b in pairs], axis=-1)  # noqa: E731
-    J = {"axis": slope(0), "rate": slope(3), "point": None if point is None else slope(1)}
+    J = {"axis": slope(0), "rate": slope(3), "point": None if point is None else slope(1),
+         "pitch": None if pitch is None else slope(2)}  # fmt: skip
     return J, axis, point, pitch, rate
 
 

@@ -137,7 +137,7 @@ def hypotheses(poses: Poses, rng: np.random.Generator, count: int = 60) -> list[
         twist, _ = make("prismatic", np.zeros(3), direction, centre, size)
         found.append(_judged(twist, shift @ twist.v, poses, shift, turn, w, size))
         axis = _dominant(turn[rows], w[rows])
-        q = turn @ axis
+        q = np.unwrap(turn @ axis)  # a lid turns by more than half a turn; between key frames by less
         if np.abs(q[rows]).max() < 1e-4:
             continue
         # (I - R_t)(c - centre) = shift_t, without the part along the axis.
