@@ -14,7 +14,8 @@ from reconstruct.joint.rigid.twist import KINDS
 
 PRIOR = {"prismatic": 0.48, "revolute": 0.48, "screw": 0.04}
 TURN_PRIOR = 1.0
-"""Total rotation of a hinge, rad: standard deviation of the prior in each of the two directions across the motion."""
+"""Total rotation of a hinge, rad: width of the prior in each of the two directions across the motion; the stroke over the
+link's size where that is less."""
 PITCH_PRIOR = 0.3
 """Shift along the axis over a screw's stroke, in sizes of the link."""
 
@@ -104,7 +105,9 @@ def _occam(st: State, obs: Observations, noise: Noise, inflation: float) -> floa
     across = np.linalg.svd(v[None])[2][1:]  # two directions across the origin's motion
     turn = stroke * across @ B[:3] @ cov @ B[:3].T @ across.T
     sign, logdet = np.linalg.slogdet(turn + 1e-18 * np.eye(2))
-    width = np.log(TURN_PRIOR**2) - 0.5 * logdet
+    # Hinges lie about a link's size away: a small stroke is a small turn, and a hinge has no less a claim to it.
+    usual = min(TURN_PRIOR, stroke / st.twist.size)
+    width = 2 * np.log(usual) - 0.5 * logdet
     if st.twist.kind == "screw":
         w_hat = st.twist.w / max(np.linalg.norm(st.twist.w), 1e-12)
         grad = w_hat @ B[3:] + (st.twist.v / max(np.linalg.norm(st.twist.w), 1e-6)) @ B[:3]
