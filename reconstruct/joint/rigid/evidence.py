@@ -14,8 +14,8 @@ from reconstruct.joint.rigid.twist import KINDS
 
 PRIOR = {"prismatic": 0.48, "revolute": 0.48, "screw": 0.04}
 TURN_PRIOR = 1.0
-"""Total rotation of a hinge, rad: width of the prior in each of the two directions across the motion; the stroke over the
-link's size where that is less."""
+"""Total rotation of a hinge, rad: width of the prior in each of the two directions across the motion; the stroke
+over the link's size where that is less."""
 PITCH_PRIOR = 0.3
 """Shift along the axis over a screw's stroke, in sizes of the link."""
 
