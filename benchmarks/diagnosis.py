@@ -189,8 +189,10 @@ def tables(rows: list[dict]) -> str:
               "confusable": lambda s: s.startswith("confusable:"),
               "points": lambda s: s.startswith("points:")}  # fmt: skip
     body = []
-    for name, mine in groups.items():
-        cell = [r for s, c in by.items() if mine(s) for r in c]
+    parts = {name: [r for s, c in by.items() if mine(s) for r in c] for name, mine in groups.items()}
+    clear = {f"{name}, effect / noise >= 5": [r for r in parts[name] if r["nominal"] >= 5]
+             for name in ("single effects", "pairs")}  # fmt: skip
+    for name, cell in (clear | parts).items():
         if not cell:
             continue
         n, bad = len(cell), sum(r["wrong"] for r in cell)

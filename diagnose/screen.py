@@ -22,6 +22,7 @@ from diagnose.noise import Noise
 from diagnose.simulate import Episode
 
 WINDOW = 1.5  # s
+REST, LONG, FEW = 0.03, 0.1, 12  # of the speed: at rest below; s: for so long; rows that a window needs
 BEAM = 24  # sets of one size that are extended
 SHAPES = 2  # starts of one set (places, widths)
 
@@ -60,6 +61,7 @@ class Regression:
         self.parts = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         self.slope = (plant.static(m.q + 1e-5) - plant.static(m.q - 1e-5)) / 2e-5
         self.lines: list[tuple[np.ndarray, np.ndarray]] = []  # rows and an orthonormal basis of each window's lines
+        self.rest = np.zeros(len(m.q), bool)  # rows that say nothing
         y = np.empty(len(m.q))
         if problem.driven:
             self.y = m.residual
@@ -68,14 +70,34 @@ class Regression:
             known = m.residual[part] + plant.inertia * m.a[part] - e.u
             y[part] = e.log.q - (_twice(known, e.t) + _driven(e, e.torque)) / plant.inertia
             edges = [_driven(e, p) / plant.inertia for p in e.edges]
-            for rows in np.array_split(np.arange(len(e.t)), max(1, int(round(e.t[-1] / WINDOW)))):
+            for rows in self._windows(e, part):
                 t = e.t[rows] - e.t[rows].mean()
                 Q = np.linalg.qr(np.stack([np.ones(len(t)), t, *(x[rows] for x in edges)], axis=1))[0]
                 self.lines.append((rows + part.start, Q))
         self.y = self._free(y)
 
+    def _windows(self, e: Episode, part: slice) -> list[np.ndarray]:
+        """Rows of each window, broken where the part is at rest: what sticks is held by any friction up to its level,
+        and the sign of its noisy velocity is no torque's. Its rows are left out."""
+        still = np.abs(e.v) < REST * self.problem.motion.speed
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+        dead = np.zeros(len(e.t), bool)
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            if e.t[min(b, len(e.t) - 1)] - e.t[a] >= LONG:
+                dead[a:b] = True
+        moves = np.flatnonzero(np.diff(np.concatenate([[True], dead, [True]]).astype(int)))
+        out = []
+        for a, b in zip(moves[::2], moves[1::2], strict=True):
+            if b - a < FEW:
+                dead[a:b] = True
+                continue
+            out += np.array_split(np.arange(a, b), max(1, int(round((e.t[b - 1] - e.t[a]) / WINDOW))))
+        self.rest[part] = dead
+        return out
+
     def _free(self, x: np.ndarray) -> np.ndarray:
         out = x.copy()
+        out[self.rest] = 0.0
         for rows, Q in self.lines:
             out[rows] -= Q @ (Q.T @ x[rows])
         return out

@@ -253,6 +253,12 @@ class Search:
                 out.append(other)
         scaled = self._scaled(best.causes)
         if scaled is not None:
+            # From zero a fit does not find its way to another period; from the exact equivalent it is there.
+            f = fit(self.fitted, candidate_of(self.fitted, scaled, self._scaled_terms(best)), self.noise,
+                    local=best.fit.local)  # fmt: skip
+            if scaled not in self.done or f.chi2 < self.done[scaled].chi2:
+                self.done[scaled] = f
+                self.judged.pop(scaled, None)
             other = self._judge(scaled)
             if 0.5 * (other.fit.chi2 - best.fit.chi2 + other.held.chi2 - best.held.chi2) < RIVAL:
                 out.append(other)
@@ -267,6 +273,17 @@ class Search:
                    "coulomb_friction": p.frictionloss > 0, "spring": p.stiffness > 0}  # fmt: skip
         names = {*_less(causes, "inertia"), *(n for n, there in torques.items() if there)}
         return _sorted(n for n in names if not any(n in CAUSES[m].contains for m in names)) if names else None
+
+    def _scaled_terms(self, best: Scored) -> dict[str, float]:
+        """The best set's terms with its inertia turned into a factor on all torques, the nominal ones too."""
+        p, terms = self.fitted.plant, best.fit.terms()
+        ratio = p.inertia / (p.inertia + terms["inertia"])
+        strengths = ("damping", "drag", "coulomb", "stiction", "stiffness", "spring_torque", "torque", "gravity_sin",
+                     "gravity_cos", "stop_stiffness", "stop_damping", "detent_strength")  # fmt: skip
+        out = {k: v * ratio if k in strengths else v for k, v in terms.items() if k != "inertia"}
+        own = {"gravity_sin": p.gravity[0], "gravity_cos": p.gravity[1], "damping": p.damping[0],
+               "coulomb": p.frictionloss, "stiffness": p.stiffness}  # fmt: skip
+        return out | {k: out.get(k, 0.0) + (ratio - 1) * v for k, v in own.items() if v}
 
     def _left(self, found: Found) -> None:
         """Is anything left? Slow residual beyond the noise says so, and free torques over q and velocity."""
