@@ -21,7 +21,7 @@ from diagnose.simulate import needed, row_of
 
 CUT = 0.1  # of the nominal held-out error, that the whole set must leave at most
 WITHOUT = 3.0  # times the held-out error, if the cause is left out
-SAME = 0.25  # relative deviation of its strength anywhere; friction that doubles over a log deviates by 0.33
+SAME = 0.1  # relative deviation of its strength anywhere; friction that doubles over a log deviates by 0.33
 SEEN = 0.05  # share of the cause's effect that a part of the data must hold to be asked
 REST = 0.02  # of the largest speed, below which the part may be at rest
 RIVAL = 1.15  # times the held-out error within which another cause in its place does as well
