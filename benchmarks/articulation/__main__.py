@@ -2,6 +2,7 @@
 
     python -m benchmarks.articulation --rows 1 2 --out results.json          # all objects, motions, cameras
     python -m benchmarks.articulation --rows 3 --objects laptop storage --motions open twice --cameras static
+    python -m benchmarks.articulation --rows 4 --motions open twice          # rendered pixels, through the tracker
     python -m benchmarks.articulation --table results.json                   # the table of results on disk
     python -m benchmarks.articulation --scaling scaling.png                  # cost over tracks and frames
 
@@ -35,12 +36,12 @@ class Case:
     row: int
     seed: int
     focal_known: bool
+    texture: str = ""
 
     @property
     def key(self) -> str:
-        return f"{self.row}/{self.model}:{self.motion}:{'orbit' if self.orbit else 'static'}" + (
-            ":small" if self.small else ""
-        )
+        parts = [f"{self.row}/{self.model}", self.motion, "orbit" if self.orbit else "static"]
+        return ":".join([*parts, *["small"] * self.small, *filter(None, [self.texture])])
 
 
 @cache
@@ -62,21 +63,26 @@ def run(case: Case) -> dict:
     from benchmarks.articulation.bound import bound
     from benchmarks.articulation.engines import solve
     from benchmarks.articulation.noise import give
+    from benchmarks.articulation.pixels import film
     from benchmarks.articulation.scenes import Hidden
     from benchmarks.articulation.scores import score
 
     try:
-        scene = _scene(case.model, case.motion, case.orbit, case.small, case.seed)
+        if case.row == 4:
+            given = film(_models()[case.model], case.motion, case.texture, case.small, case.seed)
+        else:
+            scene = _scene(case.model, case.motion, case.orbit, case.small, case.seed)
+            given = give(scene, case.row, case.seed)
     except Hidden as reason:
         return {"key": case.key, "left_out": str(reason)}
-    given = give(scene, case.row, case.seed)
-    best = bound(given, case.focal_known) if case.row > 1 else None
+    best = bound(given, case.focal_known) if case.row in (2, 3) else None
     row = score(given, solve(given, best, case.focal_known, case.seed), best)
-    return {"key": case.key, "seed": case.seed, **row}
+    return {"key": case.key, "seed": case.seed, **({"texture": case.texture} if case.texture else {}), **row}
 
 
 def cases(args: argparse.Namespace) -> Iterator[Case]:
     from benchmarks.articulation.motions import MOTIONS
+    from benchmarks.articulation.pixels import TEXTURES
 
     names = [n for n in _models() if not args.objects or any(o == n or o == n.split("/")[0] for o in args.objects)]
     for model in names:
@@ -84,15 +90,19 @@ def cases(args: argparse.Namespace) -> Iterator[Case]:
             for camera in args.cameras:
                 for extent in args.extents:
                     for row in args.rows:
-                        yield Case(model, motion, camera == "orbit", extent == "small", row, args.seed,
-                                   not args.focal_unknown)  # fmt: skip
+                        # Pixels: painted boxes before a camera that rests.
+                        if row == 4 and (camera == "orbit" or _models()[model].source != "procedural"):
+                            continue
+                        for texture in TEXTURES if row == 4 else [""]:
+                            yield Case(model, motion, camera == "orbit", extent == "small", row, args.seed,
+                                       not args.focal_unknown, texture)  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:
     from benchmarks.articulation.table import markdown, worst
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks.articulation", description=__doc__.split("\n")[0])
-    parser.add_argument("--rows", type=int, nargs="+", default=[1, 2, 3], choices=[1, 2, 3])
+    parser.add_argument("--rows", type=int, nargs="+", default=[1, 2, 3], choices=[1, 2, 3, 4])
     parser.add_argument("--objects", nargs="*", help="names or models; all when left out")
     parser.add_argument("--motions", nargs="*", help="open half close return pause hurry twice; all when left out")
     parser.add_argument("--cameras", nargs="+", default=["static", "orbit"], choices=["static", "orbit"])
@@ -100,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--limit", type=int, help="only so many cases, drawn from all that were asked for")
-    parser.add_argument("--focal-unknown", action="store_true", help="row 3: do not give the focal length")
+    parser.add_argument("--focal-unknown", action="store_true", help="rows 3, 4: do not give the focal length")
     parser.add_argument("--out", type=Path, help="JSON lines, one a case; appended to")
     parser.add_argument("--table", type=Path, help="print the table of such a file and stop")
     parser.add_argument("--scaling", type=Path, help="measure the fit's cost over tracks and frames, draw it, and stop")

@@ -63,9 +63,10 @@ def groups(rows: list[dict]) -> dict[str, list[dict]]:
         for number in sorted({r["row"] for r in rows}):
             for orbit in (False, True):
                 some = [r for r in rows if (r["row"], r["orbit"], r["small"]) == (number, orbit, small)]
-                if some:
+                for texture in sorted({r.get("texture", "") for r in some}):
                     camera = "orbiting camera" if orbit else "static camera"
-                    out[", ".join([NAMES[number], camera, *["small motion"] * small])] = some
+                    name = [NAMES[number], camera, *["small motion"] * small, *filter(None, [texture])]
+                    out[", ".join(name)] = [r for r in some if r.get("texture", "") == texture]
     return out
 
 

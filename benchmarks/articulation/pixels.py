@@ -1,0 +1,162 @@
+"""Row 4: the benchmark's objects as pixels, and the tracks that the project's own tracker makes of them.
+
+The procedural objects are painted, set before a papered wall, lit, rendered, and a hand that holds the link is rendered
+with them; hand detection and point tracking see nothing but the pictures. What is true of a track is read off the
+surface under the pixel in which it was seeded.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from benchmarks.articulation.motions import FOCAL, SIZE, Shot, pixel_rays, shoot
+from benchmarks.articulation.noise import Given
+from benchmarks.articulation.objects import Model
+from benchmarks.articulation.scenes import Hidden, Scene, project, rng_of
+
+TEXTURES = ("plain", "wood", "rich")
+FRAMES = 48
+DIAGONAL = 0.55
+"""m, of the rendered object: everything is brought to a size that a hand can hold."""
+STRAY_PX = 3.0
+
+
+def film(model: Model, motion: str, texture: str, small: bool = False, seed: int = 0, frames: int = FRAMES) -> Given:
+    """Tracks of one rendered clip, as an estimator is given them, with the truth about each.
+
+    Args:
+        model: a procedural one (boxes only).  motion, small: as in the other rows.  texture: one of TEXTURES.
+
+    Raises:
+        Hidden: the hand or the object itself hides the link, or nothing was tracked.
+    """
+    from reconstruct.providers.lk_tracks import track_points
+    from reconstruct.providers.mediapipe_hand import detect_hands
+    from reconstruct.video import Video
+
+    rng = rng_of(seed, model.name, motion, texture, "small" if small else "full")
+    shot = shoot(model, motion, False, small, frames, rng)
+    images = pictures(model, shot, texture, rng)
+    video = Video(Path("rendered.mp4"), "0" * 64, SIZE, np.arange(frames) / 24, np.arange(frames), frames,
+                  np.ascontiguousarray(images[..., ::-1]), 1.0)  # fmt: skip
+    hands = detect_hands(video)
+    tracks = track_points(video, hands)
+    if not len(tracks.uv):
+        raise Hidden(f"{model.name}: nothing was tracked")
+    return _known(model, motion, small, shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+
+
+def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, visible: np.ndarray,
+           reference: np.ndarray) -> Given:  # fmt: skip
+    """Tracks with the surface point that each was seeded on."""
+    N, T = visible.shape
+    points, moving = np.zeros((N, 3)), np.zeros(N, bool)
+    for f in np.unique(reference):
+        rows = np.flatnonzero(reference == f)
+        camera = shot.T_world_camera[f]
+        rays = pixel_rays(uv[rows, f], shot.K, camera)
+        distance, geom = model.cast(float(shot.q[f]), camera[:3, 3], rays)
+        met = geom >= 0
+        on = met & model.moving_geoms[geom]
+        world = camera[:3, 3] + rays * np.where(met, distance, 1e3)[:, None]
+        back = model.link_pose(float(shot.q[0]), float(shot.q[f]))
+        world[on] = world[on] @ back[:3, :3].T + back[:3, 3]
+        points[rows], moving[rows] = world, on
+    if moving.sum() < 8:
+        raise Hidden(f"{model.name}: {int(moving.sum())} tracks were seeded on the moving link")
+    world = np.repeat(points[:, None], T, axis=1)
+    poses = model.link_pose(shot.q, float(shot.q[0]))
+    world[moving] = np.einsum("tij,nj->nti", poses[:, :3, :3], points[moving]) + poses[:, :3, 3]
+    true, depth = project(world, shot)
+    both = np.concatenate([model.corners(float(shot.q[0]), True), model.corners(float(shot.q[0]), False)])
+    scene = Scene(model, motion, False, small, shot, points, moving, reference, true, depth, visible,
+                  float(np.linalg.norm(np.ptp(both, axis=0))), np.zeros(N))  # fmt: skip
+    wrong = visible & (np.linalg.norm(np.nan_to_num(uv - true), axis=-1) > STRAY_PX)
+    return Given(scene, 4, np.where(visible[..., None], uv, np.nan), visible, None, None, wrong, 0.0, 0.0, 0.0)
+
+
+def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -> np.ndarray:
+    """(T, H, W, 3) uint8 RGB."""
+    from scipy.spatial.transform import Rotation
+
+    from reconstruct.synth import textures as tx
+    from reconstruct.synth.animation import Motion
+    from reconstruct.synth.hand_model import HandPose, landmarks
+    from reconstruct.synth.objects import Box
+    from reconstruct.synth.objects import Model as Shown
+    from reconstruct.synth.render import render
+    from reconstruct.synth.staging import Clip
+
+    q0 = float(shot.q[0])
+    corners = np.concatenate([model.corners(q0, True), model.corners(q0, False)])
+    scale = DIAGONAL / float(np.linalg.norm(np.ptp(corners, axis=0)))
+    camera = shot.T_world_camera[0]
+    # The lamps stand at low y: the whole scene is turned so that the camera does too.
+    heading = np.arctan2(camera[1, 2], camera[0, 2])
+    turn = Rotation.from_euler("z", np.pi / 2 - heading).as_matrix()
+    there = lambda X: scale * np.asarray(X) @ turn.T  # noqa: E731
+    boxes = []
+    colours = {True: rng.uniform(0.35, 0.8, 3), False: rng.uniform(0.35, 0.8, 3)}
+    model.pose(q0)
+    for g in range(model.mj.ngeom):
+        if int(model.mj.geom_type[g]) != int(mujoco.mjtGeom.mjGEOM_BOX):
+            raise ValueError(f"{model.name}: row 4 renders boxes only")
+        on = bool(model.moving_geoms[g])
+        boxes.append(Box("moving" if on else "static", there(model._data.geom_xpos[g]),
+                         2 * scale * model.mj.geom_size[g], _paint(texture, colours[on]),
+                         turn @ model._data.geom_xmat[g].reshape(3, 3)))  # fmt: skip
+    view = turn @ camera[:3, :3]  # camera to world
+    eye, middle = there(camera[:3, 3]), there(corners.mean(0))
+    wall = middle + 1.1 * DIAGONAL * view[:, 2]
+    paper = tx.with_stickers(tx.plaster((0.80, 0.77, 0.70)), 30, 0.18)
+    boxes.append(Box("room", wall + 0.05 * view[:, 2], np.array([4.0, 3.0, 0.04]), paper, view, 300.0))
+    # A hand on the link's part that moves most, from below, between the camera and the object.
+    pose = HandPose()
+    grip = _grip(model, shot, rng)
+    fingers = view @ (np.array([-0.3, -0.7, 0.5]) / np.linalg.norm([-0.3, -0.7, 0.5]))
+    palm = view[:, 2] - (view[:, 2] @ fingers) * fingers
+    palm /= np.linalg.norm(palm)
+    R = np.stack([np.cross(fingers, palm), fingers, palm], axis=1)
+    tip = landmarks(pose)[12]
+    poses = model.link_pose(shot.q, q0)
+    hand = np.tile(np.eye(4), (len(shot.q), 1, 1))
+    hand[:, :3, :3] = R
+    hand[:, :3, 3] = there(poses[:, :3, :3] @ grip + poses[:, :3, 3]) - R @ tip - 0.012 * view[:, 2]
+    link = np.tile(np.eye(4), (len(shot.q), 1, 1))
+    link[:, :3, :3] = turn @ poses[:, :3, :3] @ turn.T
+    link[:, :3, 3] = there(poses[:, :3, 3])
+    look = np.eye(4)
+    look[:3, :3], look[:3, 3] = view.T, -view.T @ eye
+    shown = Shown(tuple(boxes), None, None, None, 0.0, (0.0, 0.0))
+    clip = Clip("row 4", "", shown, pose, "right", hand[0], np.zeros(3), np.zeros(3), eye, middle, FOCAL / SIZE[0])
+    T = len(shot.q)
+    motion = Motion(np.arange(T) / 24, shot.q, np.ones(T, bool), link, hand, np.tile(look, (T, 1, 1)))
+    return render(clip, motion, SIZE, int(rng.integers(1 << 30))).image
+
+
+def _paint(texture: str, colour: np.ndarray):
+    from reconstruct.synth import textures as tx
+
+    c = (float(colour[0]), float(colour[1]), float(colour[2]))
+    if texture == "plain":
+        return tx.paint(c, 0.03)
+    return tx.wood(c, 0.2) if texture == "wood" else tx.with_stickers(tx.wood(c, 0.2), 5, 0.06)
+
+
+def _grip(model: Model, shot: Shot, rng: np.random.Generator) -> np.ndarray:
+    """(3,) a point of the link at frame 0 that is seen there and moves much."""
+    u, v = np.meshgrid(np.arange(4, SIZE[0], 8.0), np.arange(4, SIZE[1], 8.0))
+    camera = shot.T_world_camera[0]
+    rays = pixel_rays(np.stack([u, v], axis=-1), shot.K, camera).reshape(-1, 3)
+    distance, geom = model.cast(float(shot.q[0]), camera[:3, 3], rays)
+    on = (geom >= 0) & model.moving_geoms[geom]
+    if on.sum() < 5:
+        raise Hidden(f"{model.name}: the moving link is not seen in the first frame")
+    X = camera[:3, 3] + rays[on] * distance[on, None]
+    far = model.link_pose(float(shot.q[np.argmax(np.abs(shot.q - shot.q[0]))]), float(shot.q[0]))
+    moved = np.linalg.norm(X @ far[:3, :3].T + far[:3, 3] - X, axis=1)
+    best = np.flatnonzero(moved >= np.quantile(moved, 0.8))
+    return X[rng.choice(best)]
