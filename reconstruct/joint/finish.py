@@ -196,7 +196,8 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     some = _spread_out(T, MOST_FRAMES if still is None else FREE_FRAMES)
     best = {k: replace(b, q=b.q[some] - b.q[some[0]]) for k, b in best.items()}
     lead = best[kind]
-    like = view.sightings(uv[members], some)
+    # Errors last as long as in the first round, in frames of this one.
+    like = view.sightings(uv[members], some, max(1.0, sight.lasting * len(some) / len(sight.frames)))
     more, X = followers(lead, uv, np.setdiff1d(np.arange(len(uv)), members), view, like)
     members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
     sight = view.sightings(uv[members], some, lasting=100.0)
@@ -241,7 +242,10 @@ def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
         # Gross outliers are not the noise.
         r = np.where((sight.seen & (np.sum(e**2, axis=-1) < (4 * sigma) ** 2))[..., None], e, 0.0)
         rho, lasting = shared_error(r, sight.seen, cluster), lasting_error(r, sight.seen)
-        lost = strayed(e, sight.seen, sigma, lasting)
+        link = np.ones(len(e), bool) if sight.link is None else sight.link
+        lost = np.zeros(sight.seen.shape, bool)
+        for body in (link, ~link):
+            lost[body] = strayed(e[body], sight.seen[body], sigma, lasting)
         sight = replace(sight, seen=sight.seen & ~lost, lasting=lasting)
     # Errors that neighbours share are no noise: they stay for as long as the tracks do.
     alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2

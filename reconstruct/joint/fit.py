@@ -152,20 +152,25 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
         return _Consensus(refusal="no tracks move together for long enough to draw a joint", scattered=True)
     # The hinge contains the slide: it has to explain clearly more to name the tracks of the link.
     worth = {kind: explained(s, obs)[0] * (SIMPLER if kind == "prismatic" else 1.0) for kind, s in best.items()}
-    s = best[max(worth, key=lambda kind: worth[kind])]
-
     # All moving tracks, not just the sample of the search, for the consensus set.
     every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
-    s = refine(_redepth(s, every), every, scales=(3.0, 2.0), iterations=8)
-    total, share = explained(s, every)
-    follows = share > 0.5
-    few = follows.sum() < MIN_INLIERS
-    link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
-                        every.frames)  # fmt: skip
-    starts = {kind: (_redepth(b, link), link) for kind, b in best.items()}
-    starts[s.kind] = (replace(s, depth=s.depth[follows]), link)
-    return _Consensus(starts, moving[ids[follows]], total,
-                      _why_refused(s, every, follows) or "", bool(few))  # fmt: skip
+    first: _Consensus | None = None
+    for kind in sorted(best, key=lambda kind: -worth[kind]):
+        # There is no joint only if every type is refuted.
+        s = refine(_redepth(best[kind], every), every, scales=(3.0, 2.0), iterations=8)
+        total, share = explained(s, every)
+        follows = share > 0.5
+        link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
+                            every.frames)  # fmt: skip
+        starts = {k: (_redepth(b, link), link) for k, b in best.items()}
+        starts[kind] = (replace(s, depth=s.depth[follows]), link)
+        found = _Consensus(starts, moving[ids[follows]], total, _why_refused(s, every, follows) or "",
+                           bool(follows.sum() < MIN_INLIERS))  # fmt: skip
+        if not found.refusal:
+            return found
+        first = first or found
+    assert first is not None
+    return first
 
 
 def _only(uv: np.ndarray, span: slice) -> np.ndarray:

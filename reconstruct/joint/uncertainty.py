@@ -85,16 +85,27 @@ def lasting_error(r: np.ndarray, seen: np.ndarray, most: int = 40) -> float:
     return float(total)
 
 
-WINDOWS = (1, 5, 11, 25)
+def frame_noise(r: np.ndarray, seen: np.ndarray, least: float) -> np.ndarray:
+    """(T,) standard deviation of one coordinate in each frame, from the median residual of its tracks."""
+    r2 = np.where(seen, np.sum(r**2, axis=-1), np.nan)
+    out = np.full(seen.shape[1], np.inf)
+    some = seen.sum(0) >= 3
+    out[some] = np.sqrt(np.nanmedian(r2[:, some], axis=0) / (2 * np.log(2)))
+    return np.maximum(out, least)
+
+
+WINDOWS = (5, 11, 25)
 
 
 def strayed(r: np.ndarray, seen: np.ndarray, sigma: float, lasting: float) -> np.ndarray:
     """(N, T) bool: stretches of tracks that have left their point, too slowly for single residuals to show it.
 
     Sums of the residuals (N, T, 2) over windows of frames against what noise would make of them that lasts `lasting`
-    frames; the limit is the largest that noise alone would reach once in all of them.
+    frames; the limit is the largest that noise alone would reach once in all of them. The noise is that of the frame
+    (sigma at least): where all tracks err, in fast motion or because the model does, none of them has strayed.
     """
     N, T = seen.shape
+    r = r / frame_noise(r, seen, sigma)[:, None]
     limit = 2 * np.log(max(seen.sum(), 2))
     total = np.concatenate([np.zeros((N, 1, 2)), np.cumsum(np.where(seen[..., None], r, 0.0), axis=1)], axis=1)
     count = np.concatenate([np.zeros((N, 1)), np.cumsum(seen, axis=1)], axis=1)
@@ -102,9 +113,11 @@ def strayed(r: np.ndarray, seen: np.ndarray, sigma: float, lasting: float) -> np
     for n in WINDOWS:
         if n > T:
             break
+        if n < 2 * lasting:
+            continue  # a mean over so few frames says no more than one of them, which the loss has seen to
         m = count[:, n:] - count[:, :-n]
         power = np.sum((total[:, n:] - total[:, :-n]) ** 2, axis=-1)
-        power /= np.maximum(m * np.minimum(m, lasting), 1) * sigma**2
+        power /= np.maximum(m * np.minimum(m, lasting), 1)
         bad = (power > limit) & (m >= 0.5 * n)
         for k in range(n):
             out[:, k : T - n + 1 + k] |= bad
