@@ -62,10 +62,11 @@ def main() -> None:
         r = run(name, truth)
         print(json.dumps(r), file=sys.stderr, flush=True)
         unit = " of the depth" if r["type"] == "prismatic" else " deg"
-        print(f"| {name} | {r['truth']} | {r['type'] if r['verdict'] == 'ok' else r['verdict']} "
-              f"| {show(r, 'probability', '{:.2f}')} | {show(r, 'angle_deg', '{:.1f} deg')} "
-              f"| {show(r, 'distance', '{:.1%}')} | {show(r, 'range', '{:.3g}' + unit)} | {r['agree']} of {r['tracks']} "
-              f"| {r['seconds']:.0f} |", flush=True)  # fmt: skip
+        answer = r["type"] if r["verdict"] == "ok" else r["verdict"]
+        cells = [name, r["truth"], answer, show(r, "probability", "{:.2f}"), show(r, "angle_deg", "{:.1f} deg"),
+                 show(r, "distance", "{:.1%}"), show(r, "range", "{:.3g}" + unit), f"{r['agree']} of {r['tracks']}",
+                 f"{r['seconds']:.0f}"]  # fmt: skip
+        print("| " + " | ".join(cells) + " |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,18 @@
-"""A camera that moves: found from the static scene."""
+"""A camera that moves: found from the static scene, and together with the joint."""
+
+from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.cameras import camera_moves
+from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint.cameras import before_the_link, camera_moves, rougher
+from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.groups import rigid_group
 from reconstruct.joint.models import joint_transform
+from reconstruct.joint.twist import twist_of_joint
+from reconstruct.video import Video
 from tests.reconstruct.joint_scenes import FOCAL, H, W, project
 
 AXIS, POINT = np.array([0.0, 1.0, 0.0]), np.array([-0.3, 0.0, 1.8])
@@ -43,3 +50,52 @@ def test_a_static_camera_is_not_taken_for_a_moving_one():
     uv = np.repeat(rng.uniform(50, 500, (80, 1, 2)), 30, axis=1) + rng.normal(scale=0.3, size=(80, 30, 2))
     uv[:40] += np.linspace(0, 60, 30)[:, None]
     assert not camera_moves(uv, float(np.hypot(W, H)))
+
+
+def test_a_plate_is_a_body_too():
+    """Two views of a plane have no unique essential matrix; its slope is found all the same."""
+    rng = np.random.default_rng(2)
+    plate = np.column_stack([rng.uniform(-0.5, 0.5, 80), rng.uniform(-0.4, 0.4, 80), np.full(80, 1.9)])
+    plate[:, 2] += 0.5 * plate[:, 0]
+    centre = np.array([0, 0, 1.9])
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(35), 30), [0.3, 1, 0])).as_matrix()
+    cam = np.einsum("tij,nj->nti", turn, plate - centre) + centre
+    uv = project(cam) + rng.normal(scale=0.5, size=(80, 30, 2))
+    group = rigid_group(uv - [(W - 1) / 2, (H - 1) / 2], FOCAL, np.ones(80, bool))
+    assert group.members.mean() > 0.9
+    assert np.degrees(Rotation.from_matrix(group.R @ np.swapaxes(turn, 1, 2)).magnitude()).max() < 2.0
+
+
+def test_the_body_before_which_the_camera_moves_smoothly_rests():
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(40), 60), [0, 1, 0])).as_matrix()
+    centre = np.array([0, 0, 1.9])
+    t = centre - turn @ centre
+    twist, speed = twist_of_joint("revolute", AXIS, POINT, POINT + [0.3, 0.0, 0.0])
+    s = np.clip((np.arange(60) - 20) / 20, 0, 1)
+    link = before_the_link(twist, 0.5 * speed * s, turn, t)
+    assert rougher((turn, t), link, twist.anchor)
+    assert not rougher(link, (turn, t), twist.anchor)
+    # The link's points in the picture, by way of its own path and by way of the scene's.
+    x = np.array([[0.1, 0.2, 1.8]])
+    R, p = twist.pose(0.5 * speed * s)
+    world = twist.anchor + (x - twist.anchor) @ np.swapaxes(R, 1, 2) + p[:, None]
+    np.testing.assert_allclose(
+        world @ np.swapaxes(turn, 1, 2) + t[:, None], x @ np.swapaxes(link[0], 1, 2) + link[1][:, None], atol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_joint_and_camera_together():
+    uv, _ = scene(frames=40, orbit_deg=30.0)
+    T = uv.shape[1]
+    blank = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, H, W, 3))
+    video = Video(Path("none.mp4"), "0" * 64, (W, H), np.arange(T) / 30, np.arange(T), T, blank, 1.0)
+    tracks = Tracks(uv.astype(np.float32), np.isfinite(uv[..., 0]), np.zeros(len(uv), int), ProviderInfo("t", "1", "-"))
+    fit = fit_joint(video, tracks, FOCAL, camera_moving=True)
+    assert (fit.verdict, fit.type) == ("ok", "revolute")
+    axis = fit.T_camera_world[:3, :3] @ fit.axis
+    error = np.degrees(np.arccos(min(1.0, abs(axis @ AXIS))))
+    assert error < 1.5
+    assert error < 4 * fit.std["axis_deg"]
+    assert np.ptp(fit.q) == pytest.approx(1.0, rel=0.1)
+    assert np.isin(fit.point_track, np.arange(120, 180)).mean() > 0.9

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.finish import compact, type_probabilities
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.polish import Bundle, Sightings, normal_equations, place_points, polish, positions, residuals
 from reconstruct.joint.twist import Twist, twist_of_joint
-from reconstruct.joint.uncertainty import lasting_error, shared_error, spread
+from reconstruct.joint.uncertainty import lasting_error, shared_error, spread, strayed
 
 FOCAL, SIGMA = 700.0, 0.5
 number = st.floats(-2, 2)
@@ -66,6 +67,45 @@ def test_derivatives_of_the_bundle_adjustment(kind):
     step[7] = h
     slope = (cost(replace(b, q=b.q + step)) - cost(replace(b, q=b.q - step))) / (2 * h)
     assert slope == pytest.approx(n.g[G + 7], rel=1e-3, abs=0.1)
+
+
+def test_derivatives_of_free_cameras():
+    truth, s = scene("revolute", points=30, frames=12)
+    rng = np.random.default_rng(0)
+    R = Rotation.from_rotvec(rng.normal(scale=0.05, size=(12, 3))).as_matrix()
+    s = replace(s, link=np.arange(30) < 20, free=True)
+    b = replace(truth, R=R, t=rng.normal(scale=0.02, size=(12, 3)))
+    world, cam = positions(b, s)
+    r = residuals(b, s, cam)
+    n = normal_equations(b, s, world, cam, r, s.seen.astype(float))
+    cost = lambda b: 0.5 * np.sum(residuals(b, s) ** 2)  # noqa: E731
+    np.testing.assert_allclose(world[20:], np.repeat(truth.X[20:, None], 12, axis=1))
+    h, at = 1e-6, n.lead + 12 + 6 * 5
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = h
+        turned = [Rotation.from_rotvec(sign * step[:3]).as_matrix() @ R[5] for sign in (1, -1)]
+        both = []
+        for sign, Rk in zip((1, -1), turned, strict=True):
+            Rs, ts = R.copy(), b.t.copy()
+            Rs[5] = Rk
+            ts[5] += sign * step[3:]
+            both.append(cost(replace(b, R=Rs, t=ts)))
+        assert (both[0] - both[1]) / (2 * h) == pytest.approx(n.g[at + k], rel=1e-3, abs=0.1)
+    np.testing.assert_allclose(n.H, n.H.T, atol=1e-6 * np.abs(n.H).max())
+
+
+def test_a_track_that_slides_off_slowly_is_noticed_and_shared_errors_are_not():
+    rng = np.random.default_rng(0)
+    r, seen = rng.normal(size=(60, 80, 2)), np.ones((60, 80), bool)
+    assert strayed(r, seen, 1.0, 1.0).mean() < 0.03
+    r[3, 40:] += np.linspace(0, 6, 40)[:, None]
+    lost = strayed(r, seen, 1.0, 1.0)
+    assert lost[3, 60:].all()
+    assert not lost[3, :35].any()
+    assert np.delete(lost, 3, axis=0).mean() < 0.03
+    r[:, 50:60] *= 6  # all of them: fast motion, not strays
+    assert np.delete(strayed(r, seen, 1.0, 1.0), 3, axis=0).mean() < 0.03
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
