@@ -8,6 +8,7 @@ from benchmarks.articulation.engines import Answer
 from benchmarks.articulation.motions import MOTIONS
 from benchmarks.articulation.noise import LOST, OUTLIERS, give
 from benchmarks.articulation.objects import furniture, procedural
+from benchmarks.articulation.pixels import STRAY_PX, film
 from benchmarks.articulation.scenes import make_scene, project
 from benchmarks.articulation.scores import angle_deg, line_distance, score, typical
 from reconstruct.joint.models import joint_transform
@@ -183,3 +184,19 @@ def test_distances_of_parallel_and_crossing_lines():
     assert angle_deg(x, -x) == 0.0
     assert line_distance(0 * x, x, 2 * y, x) == pytest.approx(2)
     assert line_distance(0 * x, x, 2 * z + 5 * x, y) == pytest.approx(2)
+
+
+@pytest.mark.slow
+def test_tracks_of_rendered_pixels_lie_on_the_surfaces_they_were_seeded_on():
+    given = film(MODELS["storage"], "open", "rich", frames=24)
+    scene = given.scene
+    assert given.depth is None
+    assert scene.moving.sum() > 30
+    # Most observations on the link stay with their point; those that do not are named.
+    error = np.linalg.norm(given.uv - scene.uv, axis=-1)
+    on = given.visible & scene.moving[:, None]
+    assert np.median(error[on]) < 1.5
+    assert (given.wrong[on] == (error[on] > STRAY_PX)).all()
+    # The seeds are exact by construction.
+    seeds = error[np.arange(len(error)), scene.seed]
+    assert np.nanmax(seeds[scene.moving]) < 0.05
