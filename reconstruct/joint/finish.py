@@ -39,7 +39,7 @@ MOST_FRAMES, MOST_TRACKS = 220, 400
 FREE_FRAMES, MOST_STILL = 100, 200
 """The same where the camera's poses are unknown: six more numbers a frame make a step dear."""
 COARSE_FRAMES = 40
-"""Frames of the first round, which finds every type's best joint."""
+"""Frames of the first round before a moving camera, which finds every type's best joint."""
 NO_SCREW = 1e-3
 """A thread less probable than this in the first round is not looked at again: the hinge is its special case."""
 
@@ -163,7 +163,7 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
             together with the joint, whose uncertainty then holds the camera's.
     """
     T = uv.shape[1]
-    some = _spread_out(T, COARSE_FRAMES)
+    some = _spread_out(T, MOST_FRAMES if still is None else COARSE_FRAMES)
     pick = _spread_out(len(ids), MOST_TRACKS)
     # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
     sight = view.sightings(uv[ids[pick]], some, lasting=100.0)
