@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-CLIPS = ("demo", "locker", "cabinet", "drawer", "crate", "box", "laptop", "oven")
+CLIPS = ("demo", "demo_handheld", "cabinet", "drawer", "crate", "box", "laptop", "oven")
 """Those whose joint is found: see docs/notes/geometry.md for the clips that are not."""
 PREFIX = "synth-"
 """Of the ids: an asset that a user calls ``drawer`` must not stand behind one of ours."""

@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -373,6 +374,7 @@ class Diagnose(Job):
 
         case = injector.draw(1, "door", ("viscous_damping",))
         self.model, self.logs = injector.write(case, 1, self.folder, count=3, seconds=3.0)
+        self.joint = mujoco.MjModel.from_xml_path(str(self.model)).joint(0).name
         seconds = unbroken(self.work)
         self.whole = self.result()
         self.again()
@@ -386,7 +388,7 @@ class Diagnose(Job):
                 "diagnose",
                 str(self.model),
                 "--joint",
-                "joint",
+                self.joint,
                 "--data",
                 *map(str, self.logs),
                 "--out",

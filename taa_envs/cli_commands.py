@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -179,6 +180,9 @@ def view(asset_id: str, port: int) -> Outcome:
         raise TaaEnvsError(
             "the viewer needs the package viser; install it with: pip install 'taa-envs[view]'"
         ) from None
+    # A shell that starts it in the background leaves Ctrl-C ignored; a service manager ends it with SIGTERM.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     print(f"{asset_id} at {viewer.url}; stop with Ctrl-C", file=sys.stderr)
     try:
         while True:

@@ -231,12 +231,14 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
 def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
     """The sightings with what their errors are like: strayed stretches gone, how long errors last, and weights.
 
-    Judged by the most flexible type, so that no type is helped.
+    Errors are judged by the type that fits best. A stretch has strayed if it leaves every type's points: what only the
+    best one's contradict would be evidence against that type, taken away.
     """
     lead = min(best.values(), key=lambda b: b.cost)
     sigma = max(lead.sigma, 0.05)
     cluster = clusters(lead, sight.link)
     e = residuals(lead, sight)
+    others = [(residuals(b, sight), max(b.sigma, 0.05)) for b in best.values() if b is not lead]
     rho = 0.0
     for _ in range(2):
         # Gross outliers are not the noise.
@@ -244,8 +246,12 @@ def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
         rho, lasting = shared_error(r, sight.seen, cluster), lasting_error(r, sight.seen)
         link = np.ones(len(e), bool) if sight.link is None else sight.link
         lost = np.zeros(sight.seen.shape, bool)
-        for body in (link, ~link):
+        # Only with a moving camera, whose path a stray bends; before a resting one the loss deals with single tracks, and
+        # many that leave a joint's points together say that there is no such joint.
+        for body in (link, ~link) if sight.free else ():
             lost[body] = strayed(e[body], sight.seen[body], sigma, lasting)
+            for other, scale in others:
+                lost[body] &= strayed(other[body], sight.seen[body], scale, lasting)
         sight = replace(sight, seen=sight.seen & ~lost, lasting=lasting)
     # Errors that neighbours share are no noise: they stay for as long as the tracks do.
     alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2

@@ -42,24 +42,23 @@ def tracks(request: Request) -> Made:
     pose = np.asarray(camera["T_world_camera"], float)
     count = min(int(section.get("frames", WINDOW)), T)
     stride = max(1, -(-(T - 1) // max(1, count - 1)))  # the window reaches the other end of the video
-    span = count * stride  # what the script wants to be there
+    # Both runs look at the same frames: two sets of tracks that share none would not tie their states together.
+    shared = np.minimum(np.arange(count) * stride, T - 1)
     repository = setting(section, name, "repository")
     all_xyz = []
     for direction in (1, -1):
-        order = np.arange(T)[::direction]
+        window = shared[::direction]
         work = request.work / name
         asked, answer = work / f"input{direction:+d}.npz", work / f"dense{direction:+d}.npz"
         work.mkdir(parents=True, exist_ok=True)
         answer.unlink(missing_ok=True)
-        # The script demands count * stride frames and looks at every stride-th; the last frame fills up the rest.
-        padded = np.concatenate([order, np.full(max(0, span - T), order[-1])])
-        write_input(asked, video, depth, K, pose, padded)
+        # The script demands count * stride frames and looks at every stride-th.
+        write_input(asked, video, depth, K, pose, np.repeat(window, stride))
         run_script(name, section, repository / "scripts" / "inference_user_video.py",
                    ["--checkpoint_path", setting(section, name, "checkpoint"), "--input_npz", asked,
                     "--output_npz", answer, "--num_frames", str(count), "--frame_stride", str(stride)],
                    work / f"log{direction:+d}.txt", [answer],
                    lambda share, d=direction: request.tell((share + (d < 0)) / 2))  # fmt: skip
-        window = padded[: span : stride][:count]
         all_xyz.append(read_output(answer, window, T, pose, depth, video.size))
     xyz = np.concatenate(all_xyz)
     uv, z = project(xyz, K, pose)

@@ -6,10 +6,14 @@ Each script is run by the interpreter that the settings name, checks its input a
 
 from __future__ import annotations
 
+import importlib.machinery
 import stat
 import sys
+import types
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 COMMON = '''
@@ -56,20 +60,21 @@ columns = ((np.arange(w) + 0.5) * z.shape[2] / w).astype(int)
 zz = z[0][np.ix_(rows, columns)]
 x = np.stack([(columns[None] - cx) / fx * zz, (rows[:, None] - cy) / fy * zz, zz], -1)
 reverse = "-1" in Path(a.input_npz).stem
-order = np.arange(len(truth["T_camera_world"]))[:: -1 if reverse else 1]
-frames = np.concatenate([order, np.full(max(0, span - len(order)), order[-1])])[:span:a.frame_stride]
+frames = np.minimum(np.arange(a.num_frames) * a.frame_stride, len(truth["T_camera_world"]) - 1)[:: -1 if reverse else 1]
 first = frames[0]
 link = truth["moving"][first]
 link = link[((np.arange(h) + 0.5) * link.shape[0] / h).astype(int)]
 link = link[:, ((np.arange(w) + 0.5) * link.shape[1] / w).astype(int)]
 camera, body = truth["T_camera_world"], truth["T_world_moving"]
 to_world = np.linalg.inv(camera[first])
+unit = float(truth["unit"]) if "unit" in truth else 1.0  # of the depth it was given, in the simulator's metres
+x = x / unit
 world = x @ to_world[:3, :3].T + to_world[:3, 3]
 out = []
 for t in frames:
     M = camera[first] @ body[t] @ np.linalg.inv(body[first]) @ to_world
     out.append(np.where(link[..., None], x @ M[:3, :3].T + M[:3, 3], x))
-out = np.stack(out).astype(np.float32)
+out = (unit * np.stack(out)).astype(np.float32)
 if word == "shapes":
     out = out[:-1]
 if word == "broken":
@@ -182,3 +187,74 @@ for folder in sorted((a.scene_dir / "sam3d_scaled" / "combined").glob("cand_*"))
             continue
         trimesh.Trimesh(mesh.vertices, faces, process=False).export(out / f"{label}.glb")
 '''
+
+
+class Frames:
+    """Which frame a picture is, by its pixels."""
+
+    def __init__(self, video) -> None:
+        self.known = {np.ascontiguousarray(f[..., ::-1]).tobytes(): t for t, f in enumerate(video.frames)}
+
+    def __getitem__(self, image) -> int:
+        return self.known[np.ascontiguousarray(image).tobytes()]
+
+
+@dataclass
+class Prediction:
+    """What ``DepthAnything3.inference`` returns."""
+
+    depth: np.ndarray
+    conf: np.ndarray
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray
+
+
+def install_depth_anything(monkeypatch, truth, video, scale: float) -> list[list[int]]:
+    """``depth_anything_3.api`` with the documented calls, answering from the simulator's truth for this video's frames.
+
+    Its scale and world are its own in every run; the list that is returned gets the frames of each run.
+    """
+    frames = Frames(video)
+    runs: list[list[int]] = []
+
+    class DepthAnything3:
+        def __init__(self, model_name: str = "da3-large") -> None:
+            self.model_name = model_name
+
+        @classmethod
+        def from_pretrained(cls, name):
+            if "missing" in name:
+                raise OSError(f"{name} is not a local folder and is not a valid model identifier")
+            return cls(name)
+
+        def to(self, device):
+            return self
+
+        def eval(self):
+            return self
+
+        def inference(self, image, extrinsics=None, intrinsics=None, process_res=504,
+                      process_res_method="upper_bound_resize", export_dir=None):  # fmt: skip
+            ids = [frames[i] for i in image]
+            runs.append(ids)
+            h0, w0 = image[0].shape[:2]
+            # Shrunk to the longer side, then both sides rounded to whole patches: slightly anisotropic.
+            w = round(process_res / max(h0, w0) * w0 / 14) * 14
+            h = round(process_res / max(h0, w0) * h0 / 14) * 14
+            s = scale * (1 + 0.3 * len(runs))
+            z = np.stack([cv2.resize(np.nan_to_num(truth.depth[t], nan=9.0), (w, h)) for t in ids]) * s
+            K = truth.K.copy()
+            K[:2, 2] += 0.5  # principal point from the corner
+            K[0] *= w / truth.size[0]
+            K[1] *= h / truth.size[1]
+            first = truth.T_camera_world[ids[0]]
+            relative = truth.T_camera_world[ids] @ np.linalg.inv(first)  # its world is its first camera
+            relative[:, :3, 3] *= s
+            return Prediction(z.astype(np.float32), np.ones_like(z), relative[:, :3], np.stack([K] * len(ids)))
+
+    package, api = types.ModuleType("depth_anything_3"), types.ModuleType("depth_anything_3.api")
+    package.__spec__ = importlib.machinery.ModuleSpec("depth_anything_3", None)  # it counts as installed
+    api.DepthAnything3 = DepthAnything3
+    monkeypatch.setitem(sys.modules, "depth_anything_3", package)
+    monkeypatch.setitem(sys.modules, "depth_anything_3.api", api)
+    return runs

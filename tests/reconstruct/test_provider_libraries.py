@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import sys
 import types
-from dataclasses import dataclass
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -23,6 +22,7 @@ from reconstruct.providers.make import provide
 from reconstruct.synth import load_truth, render_clip
 from reconstruct.synth.render import LINK_CODE
 from reconstruct.video import load_video
+from tests.reconstruct import standins
 from tests.reconstruct.joint_of_tracks import axis_error, joint_between
 from tests.reconstruct.provider_scenes import small_request
 
@@ -39,69 +39,10 @@ def clip(truth, tmp_path_factory):
     return load_video(truth.video, tmp_path_factory.mktemp("frames"), long_side=240)
 
 
-class Frames:
-    """Which frame a picture is, by its pixels."""
-
-    def __init__(self, video) -> None:
-        self.known = {np.ascontiguousarray(f[..., ::-1]).tobytes(): t for t, f in enumerate(video.frames)}
-
-    def __getitem__(self, image) -> int:
-        return self.known[np.ascontiguousarray(image).tobytes()]
-
-
-@dataclass
-class Prediction:
-    depth: np.ndarray
-    conf: np.ndarray
-    extrinsics: np.ndarray
-    intrinsics: np.ndarray
-
-
 @pytest.fixture
 def depth_anything(truth, clip, monkeypatch):
     """``depth_anything_3.api`` with the documented calls; its scale and world are its own in every run."""
-    frames = Frames(clip)
-    runs = []
-
-    class DepthAnything3:
-        def __init__(self, model_name: str = "da3-large") -> None:
-            self.model_name = model_name
-
-        @classmethod
-        def from_pretrained(cls, name):
-            if "missing" in name:
-                raise OSError(f"{name} is not a local folder and is not a valid model identifier")
-            return cls(name)
-
-        def to(self, device):
-            return self
-
-        def eval(self):
-            return self
-
-        def inference(self, image, extrinsics=None, intrinsics=None, process_res=504,
-                      process_res_method="upper_bound_resize", export_dir=None):  # fmt: skip
-            ids = [frames[i] for i in image]
-            runs.append(ids)
-            h0, w0 = image[0].shape[:2]
-            # Shrunk to the longer side, then both sides rounded to whole patches: slightly anisotropic.
-            w = round(process_res / max(h0, w0) * w0 / 14) * 14
-            h = round(process_res / max(h0, w0) * h0 / 14) * 14
-            s = SCALE * (1 + 0.3 * len(runs))
-            z = np.stack([cv2.resize(np.nan_to_num(truth.depth[t], nan=9.0), (w, h)) for t in ids]) * s
-            K = truth.K.copy()
-            K[:2, 2] += 0.5  # principal point from the corner
-            K[0] *= w / truth.size[0]
-            K[1] *= h / truth.size[1]
-            first = truth.T_camera_world[ids[0]]
-            relative = truth.T_camera_world[ids] @ np.linalg.inv(first)  # its world is its first camera
-            relative[:, :3, 3] *= s
-            return Prediction(z.astype(np.float32), np.ones_like(z), relative[:, :3], np.stack([K] * len(ids)))
-
-    package, api = types.ModuleType("depth_anything_3"), types.ModuleType("depth_anything_3.api")
-    api.DepthAnything3 = DepthAnything3
-    monkeypatch.setitem(sys.modules, "depth_anything_3", package)
-    monkeypatch.setitem(sys.modules, "depth_anything_3.api", api)
+    runs = standins.install_depth_anything(monkeypatch, truth, clip, SCALE)
     monkeypatch.setattr(da3, "_last", {})
     return runs
 
@@ -175,7 +116,7 @@ def test_da3_says_what_it_cannot_do(tmp_path, truth, clip, depth_anything):
 
 @pytest.mark.parametrize("known", [False, True])
 def test_moge_depth_is_metres_at_working_size(tmp_path, truth, clip, monkeypatch, known):
-    frames, asked = Frames(clip), []
+    frames, asked = standins.Frames(clip), []
 
     class MoGeModel:
         @classmethod

@@ -42,6 +42,6 @@ def test_the_viewer_plays_the_demonstration_and_ends_cleanly():
             assert not page.errors, page.errors
             assert all(r.startswith((url, url.replace("localhost", "127.0.0.1"))) for r in page.requests), page.requests
     finally:
-        viewer.send_signal(signal.SIGINT)
+        viewer.send_signal(signal.SIGTERM)
         code = viewer.wait(30)
     assert code == 0, viewer.stderr.read()

@@ -78,9 +78,15 @@ def bending(st: State, obs: Observations) -> np.ndarray:
     seen = obs.seen[obs.link]
     tied = (seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]).sum(0) >= 3
     bent = np.abs(np.diff(st.s, 2))
-    if tied.sum() < 5:
-        return np.broadcast_to(loose(st.s), bent.shape)
     least = max(1e-5 * np.ptp(st.s), 1e-12)
+    if tied.sum() < 5:
+        # Tracks of every few frames only: how the states bend between those, per frame.
+        knots = np.flatnonzero(seen.sum(0) >= 3)
+        if len(knots) < 7:
+            return np.broadcast_to(loose(st.s), bent.shape)
+        speed = np.diff(st.s[knots]) / np.diff(knots)
+        rate = 2 * np.abs(np.diff(speed)) / (knots[2:] - knots[:-2])
+        return np.full(bent.shape, 1 / max(1.5 * np.quantile(rate, 0.9), least) ** 2)
     usual = max(1.5 * np.quantile(bent[tied], 0.9), least)
     sharp = max(np.sqrt(np.mean(bent[tied] ** 2)), usual)
     return 1 / np.where(tied, sharp, usual) ** 2
