@@ -246,8 +246,8 @@ def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
         rho, lasting = shared_error(r, sight.seen, cluster), lasting_error(r, sight.seen)
         link = np.ones(len(e), bool) if sight.link is None else sight.link
         lost = np.zeros(sight.seen.shape, bool)
-        # Only with a moving camera, whose path a stray bends; before a resting one the loss deals with single tracks, and
-        # many that leave a joint's points together say that there is no such joint.
+        # Only with a moving camera, whose path a stray bends; before a resting one the loss deals with single tracks,
+        # and many that leave a joint's points together say that there is no such joint.
         for body in (link, ~link) if sight.free else ():
             lost[body] = strayed(e[body], sight.seen[body], sigma, lasting)
             for other, scale in others:
