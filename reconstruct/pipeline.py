@@ -325,11 +325,11 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         return fit_from_cues(tracks, camera, depth, tracks_cue.get("xyz_world"), moving, video.size, metric, seed)
 
     with_depth = {key: given.get(key) for key in ("depth", "camera", "masks")} if ranged else None
-    fit: JointFit = stages.run("joint", find, ("joint",), options={"focal": focal, "with_depth": with_depth})
+    fit: JointFit = stages.run("joint", find, ("joint", "depth.py"), options={"focal": focal, "with_depth": with_depth})
     if ranged and fit.verdict == "refused":
         notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")
         ranged = False
-        fit = stages.run("joint", find, ("joint",), options={"focal": focal, "with_depth": None})
+        fit = stages.run("joint", find, ("joint", "depth.py"), options={"focal": focal, "with_depth": None})
     if fit.verdict == "refused":
         return fit, notes, 1.0
     plain = fit
