@@ -279,7 +279,7 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     if folder and scene is not None:
         folder = cues_io.CueFolder(scene, stages.chosen)
         given = folder.given()
-    tracks = stages.run("tracks", follow, ("providers/lk_tracks.py",), given=given.get("tracks"))
+    tracks = stages.run("tracks", follow, ("providers/lk_tracks.py", "providers/affine.py"), given=given.get("tracks"))
     if folder:
         folder.write("tracks", cues_io.track_arrays(tracks))
     fit, words, unit = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
@@ -292,6 +292,23 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     return Seen(stable, hands, tracks, fit, tuple(makers), (*notes, *words), known, unit)
 
 
+def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float | None, seed: int,
+                      progress: Callable[[float], None]) -> JointFit:  # fmt: skip
+    """The joint without depth; where a forearm is what was found, that without the forearms' tracks."""
+    from reconstruct.hand.forearm import on_forearm
+    from reconstruct.joint.fit import fit_joint
+
+    fit = fit_joint(video, tracks, focal, seed, progress, camera_moving=False)
+    if fit.verdict == "refused":
+        return fit
+    arm = on_forearm(tracks, hands)
+    if np.mean(arm[fit.point_track]) < 0.5:
+        return fit
+    rest = replace(tracks, visible=tracks.visible & ~arm[:, None])
+    again = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
+    return replace(again, reason=f"{again.reason}; what moved most was an arm, whose tracks are left out")
+
+
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,
            folder: cues_io.CueFolder | None, given: Mapping[str, str], seed: int,
            stages: Stages) -> tuple[JointFit, list[str], float]:  # fmt: skip
@@ -299,7 +316,6 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     length of that world's unit in the joint's."""
     from reconstruct.depth import depth_scale
     from reconstruct.hand.scale import hand_scale
-    from reconstruct.joint.fit import fit_joint
     from reconstruct.joint.rigid.cues import fit_from_cues
     from reconstruct.others import second_part, words_of
     from reconstruct.several import alongside, joint_beside
@@ -315,7 +331,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
 
     def find() -> JointFit:
         if not ranged:
-            return fit_joint(video, tracks, focal, seed, stages.progress.update, camera_moving=False)
+            return joint_off_the_arm(video, tracks, hands, focal, seed, stages.progress.update)
         depth, metric = None, bool(camera.get("metric", np.array(True)))
         if "xyz_world" not in tracks_cue:
             cue = folder.read("depth", "depth")
@@ -325,11 +341,12 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         return fit_from_cues(tracks, camera, depth, tracks_cue.get("xyz_world"), moving, video.size, metric, seed)
 
     with_depth = {key: given.get(key) for key in ("depth", "camera", "masks")} if ranged else None
-    fit: JointFit = stages.run("joint", find, ("joint", "depth.py"), options={"focal": focal, "with_depth": with_depth})
+    parts = ("joint", "depth.py", "hand/forearm.py")
+    fit: JointFit = stages.run("joint", find, parts, options={"focal": focal, "with_depth": with_depth})
     if ranged and fit.verdict == "refused":
         notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")
         ranged = False
-        fit = stages.run("joint", find, ("joint", "depth.py"), options={"focal": focal, "with_depth": None})
+        fit = stages.run("joint", find, parts, options={"focal": focal, "with_depth": None})
     if fit.verdict == "refused":
         return fit, notes, 1.0
     plain = fit

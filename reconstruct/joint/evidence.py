@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruct.joint.bundle import Observations, State, reprojection, transport
-from reconstruct.joint.polish import Bundle, Sightings, residuals
+from reconstruct.joint.groups import adjust
+from reconstruct.joint.polish import Bundle, Sightings, noise, residuals
 from reconstruct.joint.select import explained, explained_by
 
 
@@ -57,6 +58,38 @@ def bridged(b: Bundle, s: Sightings) -> Bridged:
     if not known.any():
         return Bridged(1.0, 0.0)
     return Bridged(float(np.average(np.minimum(e[known], 1.0), weights=w[known])), float(w[known].sum() / w.sum()))
+
+
+MOST_POSES, MOST_POINTS = 30, 150
+
+
+def looser(b: Bundle, s: Sightings) -> float | None:
+    """How many times better the joint's own points follow a body that moves freely: the ratio of the two fits' noise.
+
+    Six numbers a pose in place of one always fit a little better; that much is taken out. Before a resting camera.
+
+    Returns:
+        About 1 where the joint says all, or None if there are too few observations.
+    """
+    path = np.concatenate([[0], np.cumsum(np.abs(np.diff(b.q)))])
+    some = np.unique(np.searchsorted(path, np.linspace(0, path[-1], MOST_POSES)).clip(0, len(path) - 1))
+    lasting = np.flatnonzero(s.seen[:, some].sum(1) >= 6)
+    ids = lasting[np.unique(np.linspace(0, len(lasting) - 1, min(len(lasting), MOST_POINTS)).round().astype(int))]
+    seen = s.seen[ids][:, some]
+    # A pose that few points hold is bent by them.
+    held = seen.sum(0) >= 6
+    some, seen = some[held], seen[:, held]
+    numbers, unknown = 2 * int(seen.sum()), 6 * len(some) + 3 * len(ids)
+    if len(some) < 6 or numbers < 1.05 * unknown:
+        return None
+    focal = s.focal * float(np.exp(b.log_focal))
+    R, shift = b.twist.pose(b.q[some])
+    t = b.twist.anchor + shift - R @ b.twist.anchor
+    on_joint = np.where(seen[..., None], residuals(b, s)[ids][:, some], 0.0)
+    x = np.where(seen[..., None], s.uv[ids][:, some], np.nan) / focal
+    _, _, _, free = adjust(x, seen, R, t, b.X[ids], focal, iterations=25)
+    fair = np.sqrt(numbers / (numbers - unknown))
+    return float(noise(on_joint, seen) / max(free * fair, 1e-6))
 
 
 @dataclass(frozen=True)

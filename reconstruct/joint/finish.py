@@ -40,6 +40,9 @@ FREE_FRAMES, MOST_STILL = 100, 200
 """The same where the camera's poses are unknown: six more numbers a frame make a step dear."""
 COARSE_FRAMES = 40
 """Frames of the first round before a moving camera, which finds every type's best joint."""
+SCREW_TURN_DEG, FREE_BODY = 120.0, 0.95
+"""Between two poses every rigid motion is a screw (Chasles): only a long one is evidence for a thread. A shorter one is
+no type among the others; it stands for a body that moves freely, if it is clearly more probable than they are."""
 NO_SCREW = 1e-3
 """A thread less probable than this in the first round is not looked at again: the hinge is its special case."""
 
@@ -385,7 +388,15 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, f
     if "screw" in best:
         screw = best["screw"]
         log["screw"] = odds + log_odds_screw(screw.twist, spread(screw, sight).curvature, gain(screw, hinge))
-    return probabilities(log)
+    p = probabilities(log)
+    if "screw" in best and turn_deg(best["screw"]) < SCREW_TURN_DEG and p["screw"] < FREE_BODY:
+        p = probabilities({kind: value for kind, value in log.items() if kind != "screw"})
+    return p
+
+
+def turn_deg(b: Bundle) -> float:
+    """By how much the link turns."""
+    return float(np.degrees(np.ptp(b.q) * np.linalg.norm(b.twist.curvature)))
 
 
 def compact(X: np.ndarray, reach: float = 2.5) -> np.ndarray:

@@ -10,8 +10,8 @@ import numpy as np
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
-from reconstruct.joint.evidence import bridged, free_motion
-from reconstruct.joint.finish import Finished, Still, View, finish
+from reconstruct.joint.evidence import bridged, free_motion, looser
+from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Still, View, finish, turn_deg
 from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
@@ -24,9 +24,10 @@ MOVING_SHARE = 0.012
 MIN_INLIERS = 8
 SIMPLER = 1.05
 BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
+LOOSER = 4.0
+"""A joint is refuted if its own points follow a free body so many times better. Parts that flex, and a stabilised
+hand-held camera, stay under three."""
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
-SCREW_TURN_DEG = 120.0
-"""Between two poses every rigid motion is a screw (Chasles): only a long one is evidence for a thread."""
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
 PRIOR_STD = 0.12
@@ -219,7 +220,7 @@ def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, 
 
 def _why_not_believed(done: Finished) -> str | None:
     """A sentence if the finished joint is not one."""
-    turn = np.degrees(np.ptp(done.bundle.q) * np.linalg.norm(done.bundle.twist.curvature))
+    turn = turn_deg(done.bundle)
     if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
         return (
             f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any "
@@ -232,6 +233,12 @@ def _why_not_believed(done: Finished) -> str | None:
         return (
             f"no joint: from one state to the next the best one ({done.bundle.kind}) misses {b.error:.0%} of the way "
             "that its own points go"
+        )
+    times = looser(done.bundle, done.sight) if done.sight.R is None else None
+    if times is not None and times > LOOSER:
+        return (
+            f"the part moves as a free body: its points follow one {times:.0f} times more exactly than the best joint "
+            f"({done.bundle.kind})"
         )
     return None
 

@@ -97,12 +97,12 @@ def rigid_group(uv: np.ndarray, focal: float, candidates: np.ndarray, seed: int 
     if len(long) < MIN_GROUP:
         return None
     starts: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
-    spread = _farthest(xk[long], min(SEEDS, len(long)), rng)
+    spread = farthest(xk[long], min(SEEDS, len(long)), rng)
     for n, seed_track in enumerate(long[spread]):
-        patch, r = _neighbours(xk, seen, seed_track, PATCH[n % len(PATCH)])
+        patch, r = neighbours(xk, seen, seed_track, PATCH[n % len(PATCH)])
         if len(patch) < 8:
             continue
-        for R, t in _paths_of_patch(xk[patch], seen[patch], r, focal):
+        for R, t in paths_of_patch(xk[patch], seen[patch], r, focal):
             X = _triangulated(xk, seen, R, t)
             loss = _track_cost(xk, seen, R, t, X, focal, 6.0)
             starts.append((float(np.sum((1 - loss) * seen.sum(1))), R, t, patch))
@@ -125,7 +125,7 @@ def regrown(uv: np.ndarray, focal: float, body: Rigid, candidates: np.ndarray) -
     return _whole(x, candidates, keys, body.R[keys], body.t[keys], body.members & candidates, focal) or body
 
 
-def _farthest(xk: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+def farthest(xk: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Indices of tracks that lie far from each other in some picture (farthest-point sampling)."""
     filled = np.nan_to_num(xk - np.nanmean(xk, axis=1, keepdims=True)) + np.nanmean(xk, axis=1, keepdims=True)
     flat = filled.reshape(len(xk), -1)
@@ -139,7 +139,7 @@ def _farthest(xk: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarra
     return np.array(chosen)
 
 
-def _neighbours(xk: np.ndarray, seen: np.ndarray, track: int, count: int) -> tuple[np.ndarray, int]:
+def neighbours(xk: np.ndarray, seen: np.ndarray, track: int, count: int) -> tuple[np.ndarray, int]:
     """Tracks that stay near one in all pictures, and the key frame that sees most of them."""
     both = seen & seen[track]
     enough = both.sum(1) >= max(5, 0.6 * seen[track].sum())
@@ -150,7 +150,7 @@ def _neighbours(xk: np.ndarray, seen: np.ndarray, track: int, count: int) -> tup
     return order, int(np.argmax(seen[order].sum(0))) if len(order) else 0
 
 
-def _paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep: int = 2):
+def paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep: int = 2):
     """The camera's path about a nearly flat patch: the best slopes' (R, t), the patch's depth about 1.
 
     Args:

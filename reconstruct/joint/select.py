@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
+from reconstruct.joint.groups import farthest, neighbours, paths_of_patch
 from reconstruct.joint.hypotheses import Hypothesis, prismatic_hypotheses, revolute_hypotheses
 
 SCORE_PX = 3.0
@@ -205,6 +207,50 @@ def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator, m
     return revolute_hypotheses(rays, k, profile, w, tol, rng) + prismatic_hypotheses(rays, k, profile, w, tol, rng)
 
 
+PATCHES, PATCH_SIZES = 18, (30, 80)
+"""Neighbourhoods whose own motion is read, and their tracks."""
+
+
+def patch_states(obs: Observations, rng: np.random.Generator) -> list[State]:
+    """Hinges from neighbourhoods that are taken for flat pieces of one body, refined on all tracks; best first.
+
+    The windows' hypotheses assume that the joint turns as the picture moves. A door that is seen from its front at last
+    moves fast there and turns slowly; a neighbourhood's own path (groups.py) has its own angles.
+    """
+    x = np.where(obs.seen[..., None], obs.xy, np.nan)
+    long = np.flatnonzero(obs.seen.sum(1) >= 6)
+    if len(long) < 8:
+        return []
+    carried: list[State] = []
+    for n, track in enumerate(long[farthest(x[long], min(PATCHES, len(long)), rng)]):
+        patch, r = neighbours(x, obs.seen, track, PATCH_SIZES[n % len(PATCH_SIZES)])
+        if len(patch) < 8:
+            continue
+        keys = np.flatnonzero(obs.seen[patch].sum(0) >= 5)
+        for R, t in paths_of_patch(x[patch], obs.seen[patch], r, 1.0 / obs.px):
+            if (h := _hinge_of_path(R[keys], t[keys], keys)) is not None:
+                carried.append(extend(h, obs))
+    carried.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
+    fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in carried[:PATCHES]]
+    return sorted(fined, key=lambda s: -explained(s, obs)[0])
+
+
+def _hinge_of_path(R: np.ndarray, t: np.ndarray, keys: np.ndarray) -> Hypothesis | None:
+    """The hinge nearest to a body's poses (K, 3, 3), (K, 3) before a resting camera: d_t = (I - D_t) c."""
+    if len(keys) < 5:
+        return None
+    D = R @ R[0].T
+    d = t - D @ t[0]
+    turns = Rotation.from_matrix(D).as_rotvec()
+    axis = np.linalg.svd(turns)[2][0]
+    q = np.unwrap(turns @ axis)
+    sides = np.concatenate([(np.eye(3) - D).reshape(-1, 3), 0.05 * axis[None]])
+    point = np.linalg.lstsq(sides, np.append(d.ravel(), 0.0))[0]
+    point -= axis * (axis @ point)
+    size = np.linalg.norm(point)
+    return Hypothesis("revolute", axis, point / size, keys, q, 0.0) if size > 1e-6 else None
+
+
 def extend(h: Hypothesis, obs: Observations) -> State:
     """Carry a window's states to all key frames, one frame after the other (incremental structure from motion)."""
     K = len(obs.frames)
@@ -327,20 +373,22 @@ def search(
 ) -> list[State]:
     """Best joints of both types, best first.
 
-    A short search comes first: long windows from both ends and the middle. Where one of its joints explains most of
-    the motion in the picture down to the tracks' noise, the answer is clear; else every window is tried.
+    A short search comes first: long windows from both ends and the middle, and neighbourhoods. Where one of its joints
+    explains most of the motion in the picture down to the tracks' noise, the answer is clear; else every window is
+    tried.
     """
     K = len(obs.frames)
     few = _global_hypotheses(obs, rng, rounds=1)
     for span in (np.arange(K), np.arange(K)[::-1], np.arange(K // 2, K), np.arange(K // 2, -1, -1)):
         few += _one_window(obs, span, rng, most=40)
-    first = _best_of(few, obs, coarse // 4, max(fine // 3, 2), thorough=False)
+    more = patch_states(obs, rng)
+    first = _best_of(few, obs, coarse // 4, max(fine // 3, 2), thorough=False, more=more)
     progress(0.2)
     if first and _is_clear(first[0], obs):
         return first
     hyps = few + window_hypotheses(obs, rng)
     progress(0.5)
-    out = first + _best_of(hyps, obs, coarse, fine, thorough=True)
+    out = first + _best_of(hyps, obs, coarse, fine, thorough=True, more=more)
     progress(1.0)
     return sorted(out, key=lambda s: -explained(s, obs)[0])
 
@@ -356,14 +404,16 @@ def _is_clear(s: State, obs: Observations) -> bool:
     return bool(np.median(r[link][obs.seen[link]]) < CLEAR_PX)
 
 
-def _best_of(hyps: list[Hypothesis], obs: Observations, coarse: int, fine: int, thorough: bool) -> list[State]:
-    """Hypotheses carried to all key frames, refined and judged on all tracks; best first."""
+def _best_of(hyps: list[Hypothesis], obs: Observations, coarse: int, fine: int, thorough: bool,
+             more: list[State]) -> list[State]:  # fmt: skip
+    """Hypotheses carried to all key frames, refined and judged on all tracks, and hinges `more`; best first."""
     out: list[State] = []
     for kind in ("revolute", "prismatic"):
         pool = sorted((h for h in hyps if h.kind == kind), key=lambda h: -h.score)[:coarse]
         states = [extend(h, obs) for h in pool]
         states.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
         fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in _distinct(states, fine)]
+        fined += more if kind == "revolute" else []
         fined.sort(key=lambda s: -explained(s, obs)[0])
         last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
         if kind == "revolute":

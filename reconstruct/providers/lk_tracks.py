@@ -3,8 +3,8 @@
 One reference frame is a lottery: a closed door may have no texture where the open one has a rack of
 corners. Corners are therefore seeded in every reference frame, wherever the picture ever changes, and
 followed forwards and backwards through the whole video. Every step is checked by tracking back, and
-each point is re-registered against the last frame in which it was well anchored, so that errors do
-not pile up frame by frame.
+each point is re-registered against the last frame in which it was well anchored (affine.py), so that errors
+do not pile up frame by frame.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo, Tracks
+from reconstruct.providers.affine import register
 from reconstruct.video import Video
 
 WINDOW = 15
@@ -21,6 +22,8 @@ FB_PX = 0.7
 """Forward-backward distance above which a step counts as lost, working px."""
 ANCHOR_PX = 2.0
 """How far re-registration against the anchor may move a point before the anchor counts as outdated, working px."""
+ALIKE, STRETCH = 0.8, 2.0
+"""Correlation with the anchor frame, and stretch of its neighbourhood, up to which it stays the anchor."""
 CHANGE_GREY = 18.0
 
 
@@ -115,7 +118,7 @@ def track_points(
     if hands is not None and hands.mask is not None:
         k = np.ones((11, 11), np.uint8)
         covered = np.stack([cv2.dilate(m.astype(np.uint8), k) for m in hands.mask]) > 0
-    grey = even_exposure(video)
+    grey = np.stack(even_exposure(video))
     seeds, frames = [], []
     for r in references:
         mask = region if covered is None else region & ~covered[r]
@@ -166,7 +169,7 @@ def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
 
 
 def _follow(
-    grey: list[np.ndarray], order: list[int], uv: np.ndarray, reference: np.ndarray, covered: np.ndarray | None
+    grey: np.ndarray, order: list[int], uv: np.ndarray, reference: np.ndarray, covered: np.ndarray | None
 ) -> None:
     """Extend all tracks along `order` (in place); each starts when its reference frame comes up."""
     import cv2
@@ -176,6 +179,7 @@ def _follow(
     flags = dict(flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
     alive = np.zeros(len(uv), bool)
     anchor = reference.copy()
+    shape = np.tile(np.eye(2), (len(uv), 1, 1))
     velocity = np.zeros((len(uv), 2), np.float32)
     for s, t in zip(order[:-1], order[1:], strict=True):
         alive |= reference == s
@@ -195,22 +199,24 @@ def _follow(
             good &= ~inside
         alive[ids[~good]] = False
         ids, n = ids[good], n[good]
-        # Re-register against each point's anchor frame; group by anchor to share pyramids.
-        for a in np.unique(anchor[ids]):
-            if a == s:
-                continue
-            sel = np.flatnonzero(anchor[ids] == a)
-            pa = uv[ids[sel], a].reshape(-1, 1, 2)
-            m, ok, _ = cv2.calcOpticalFlowPyrLK(
-                grey[a], grey[t], pa, n[sel].reshape(-1, 1, 2).copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags
-            )
-            c, ok2, _ = cv2.calcOpticalFlowPyrLK(
-                grey[t], grey[a], m, pa.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, **flags
-            )
-            m = m.reshape(-1, 2)
-            fine = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(c - pa, axis=-1).ravel() < 0.5)
-            fine &= np.linalg.norm(m - n[sel], axis=-1) < ANCHOR_PX
-            n[sel[fine]] = m[fine]
-            anchor[ids[sel[~fine]]] = s  # the last frame in which the anchor still held
-        velocity[ids] = n - uv[ids, s]
         uv[ids, t] = n
+        # Against each point's anchor frame, with the shear since then; where it no longer looks alike, the last frame
+        # becomes the anchor.
+        fine = _anchored(grey, ids, t, uv, anchor, shape)
+        anchor[ids[~fine]], shape[ids[~fine]] = s, np.eye(2)
+        _anchored(grey, ids[~fine], t, uv, anchor, shape)
+        velocity[ids] = uv[ids, t] - uv[ids, s]
+
+
+def _anchored(grey: np.ndarray, ids: np.ndarray, t: int, uv: np.ndarray, anchor: np.ndarray, shape: np.ndarray
+              ) -> np.ndarray:  # fmt: skip
+    """Register points in frame t against their anchor frames, in place; (n,) bool where that succeeded."""
+    place, turned = uv[ids, t].astype(float), shape[ids]
+    before = place.copy()
+    alike = register(grey, anchor[ids], uv[ids, anchor[ids]].astype(float), t, place, turned)
+    stretch = np.linalg.svd(turned, compute_uv=False)
+    fine = (alike > ALIKE) & (np.linalg.norm(place - before, axis=-1) < ANCHOR_PX)
+    fine &= (stretch[:, 0] < STRETCH) & (stretch[:, 1] > 1 / STRETCH)
+    uv[ids[fine], t] = place[fine]
+    shape[ids[fine]] = turned[fine]
+    return fine
