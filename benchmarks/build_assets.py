@@ -21,8 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-CLIPS = ("demo", "demo_handheld", "cabinet", "drawer", "crate", "box", "laptop", "oven")
-"""Those whose joint is found: see docs/notes/geometry.md for the clips that are not."""
+CLIPS = ("demo", "demo_handheld", "cabinet", "locker", "drawer", "crate", "box", "laptop", "oven", "monitor", "puncher",
+         "stapler")  # fmt: skip
+"""All with a joint that `taa synth` renders."""
 PREFIX = "synth-"
 """Of the ids: an asset that a user calls ``drawer`` must not stand behind one of ours."""
 LEAST_PROGRESS = 0.5
