@@ -456,7 +456,7 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
     if not fit.metric:
         notes.append("no metric source; one unit of length is the moving part's median depth, taken as one metre")
     if fit.verdict == "ambiguous":
-        notes.append(f"the joint type is not certain: {fit.reason}")
+        notes.append(f"the joint is not certain: {fit.reason}")
 
     # The folder is made under a hidden name; it takes its own only when the report is in it too.
     with folder_written_whole(final, overwrite) as work:

@@ -27,6 +27,8 @@ BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
 LOOSER = 4.0
 """A joint is refuted if its own points follow a free body so many times better. Parts that flex, and a stabilised
 hand-held camera, stay under three."""
+VAGUE_DEG = 10.0
+"""Standard deviation of an axis beyond which the joint is not called certain."""
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
@@ -278,6 +280,12 @@ def _result(
             f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}{note}"
         )
     sure = done.spread
+    if verdict == "ok" and sure.axis_deg > VAGUE_DEG:
+        verdict = "ambiguous"
+        reason = (
+            f"{len(done.members)} tracks hold the axis to {sure.axis_deg:.0f} deg only; a longer motion, or more of the "
+            f"part in view, would tell; {how}{note}"
+        )
     std = {"axis_deg": sure.axis_deg, "point_m": sure.point, "q": sure.q,
            "focal_px": full_focal * (sure.log_focal if focal_std is None else focal_std)}  # fmt: skip
     fit = JointFit(

@@ -28,7 +28,7 @@ GREY, SHARE = 8.0, 0.35
 LARGEST_STEP_PX, LARGEST_SHEAR = 2.0, 0.3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _sample(image: np.ndarray, x: float, y: float) -> float:
     """Bilinear; (x, y) lies inside."""
     i, j = int(y), int(x)
@@ -38,7 +38,7 @@ def _sample(image: np.ndarray, x: float, y: float) -> float:
     return (1 - a) * top + a * bottom
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _residuals(wide: np.ndarray, target: np.ndarray, weight: np.ndarray, p: np.ndarray, S: np.ndarray,
                out: np.ndarray) -> None:  # fmt: skip
     """Absolute differences of grey values after gain and offset."""
@@ -62,7 +62,7 @@ def _residuals(wide: np.ndarray, target: np.ndarray, weight: np.ndarray, p: np.n
             out[a, b] = abs((out[a, b] - level) / gain - (wide[a + 1, b + 1] - mean))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, place: np.ndarray, shape: np.ndarray,
              half: int = HALF) -> np.ndarray:  # fmt: skip
     """Register neighbourhoods of anchor frames in another frame, in place.
