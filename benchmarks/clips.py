@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 REAL = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "videos"
-RENDERED = ("demo", "demo_handheld", "drawer", "laptop", "oven", "lift", "still")
+RENDERED = ("demo", "demo_handheld", "drawer", "laptop", "oven", "locker", "puncher", "lift", "still")
 
 
 def annotations() -> dict[str, dict]:
