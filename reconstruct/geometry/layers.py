@@ -229,13 +229,54 @@ def to_lab(image: np.ndarray) -> np.ndarray:
     return lab
 
 
-def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, costs: np.ndarray, count: int = 24,
-           rounds: int = 2) -> Evidence:
+RESTS_PX, LEAVES_PX = 1.0, 4.0
+"""A track rests if it stays this close to its median place, working px; it contradicts a cell of the link that would
+have carried it further than that."""
+
+
+def resting_cells(video: Video, tracks: Tracks, fit: JointFit, plane: LinkPlane, chart: Chart, frames: np.ndarray
+                  ) -> np.ndarray:  # fmt: skip
+    """(F, rows, cols) bool: cells about points that are seen at rest where the link would carry them along.
+
+    A shadow that moves as the link does darkens what it falls on, and both motions can explain a bare patch's colours.
+    Texture under it stays where it is.
+    """
+    import cv2
+
+    uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
+    long = np.flatnonzero(tracks.visible.sum(1) >= 5)
+    place = np.nanmedian(uv[long], axis=1)
+    off = np.nanmax(np.linalg.norm(uv[long] - place[:, None], axis=-1), axis=1)
+    long, place = long[off < RESTS_PX], place[off < RESTS_PX]
+    out = np.zeros((len(frames), *chart.shape), np.uint8)
+    every = homography(fit, plane, fit.q) @ chart.to_plane_matrix()
+    every = working_matrix(video) @ every
+    steps = np.unique(np.linspace(0, len(fit.q) - 1, 40).round().astype(int))
+    for k, t in enumerate(frames):
+        here = np.flatnonzero(tracks.visible[long, t])
+        cell = apply_homography(np.linalg.inv(every[t]), place[here])
+        rows, cols = chart.shape
+        inside = np.isfinite(cell).all(1) & (cell > -0.5).all(1) & (cell < [cols - 0.5, rows - 0.5]).all(1)
+        here, cell = here[inside], cell[inside]
+        if not len(here):
+            continue
+        # Where the cell would be in the other frames that show the track.
+        carried = np.stack([apply_homography(every[j], cell) for j in steps], axis=1)
+        leaves = np.linalg.norm(carried - place[here][:, None], axis=-1) > LEAVES_PX
+        wrong = (leaves & tracks.visible[long[here]][:, steps]).any(1)
+        for c, r in np.round(cell[wrong]).astype(int):
+            cv2.circle(out[k], (int(c), int(r)), 1, 1, -1)
+    return out > 0
+
+
+def gather(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, plane: LinkPlane, costs: np.ndarray,
+           count: int = 24, rounds: int = 2) -> Evidence:
     """Which cells of the link's plane are link.
 
     Args:
         video: stabilised, static camera.
         hands: their pixels count as unknown.
+        tracks: all; those that rest speak for the background.
         fit: the joint.
         plane: from :func:`reconstruct.geometry.plane.fit_plane`.
         costs: (T,) from :func:`frame_costs`.
@@ -270,6 +311,7 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, costs: n
     noise = _noise(video, window, frames)
     facing = np.sign(plane.facing[frames])
     link_miss = _link_residual(warped, usable, uv, facing, fit.q[frames])
+    rests = resting_cells(video, tracks, fit, plane, chart, frames).sum(0) >= 2
     occupied = seed
     score = np.zeros(chart.shape)
     seen = np.zeros(chart.shape, int)
@@ -279,12 +321,15 @@ def gather(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, costs: n
         covered = np.stack([warp_to_image(chart, grown, H[k], size) for k in range(len(frames))])
         back_miss = np.stack([sample(b, k) for k, b in enumerate(background_residual(images, covered | hand))])
         known = usable & (back_miss >= 0) & np.isfinite(link_miss)
-        ratio = np.clip((back_miss - link_miss) / (2 * noise), -3, 3)
+        ratio = np.clip((back_miss - np.where(known, link_miss, 0.0)) / (2 * noise), -3, 3)
         votes = np.where(known, weight * ratio, 0.0)
         total = (weight * known).sum(0)
         score = votes.sum(0) / np.maximum(total, 1e-9)
         seen = known.sum(0)
         score = np.where(seen >= 2, score, 0.0)
+        # Points seen at rest overrule colours that say "link", no more: they lie where there is texture only.
+        score = np.where(rests, np.minimum(score, -0.5), score)
+        seen = np.where(rests, np.maximum(seen, 6), seen)
         occupied = _smooth(score, seen, seed, warped, usable)
     return Evidence(chart, occupied, score, seen, frames)
 

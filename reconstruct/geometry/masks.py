@@ -48,11 +48,11 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
     T, h, w = video.frames.shape[:3]
     plane = fit_plane(tracks, fit)
     costs = frame_costs(video, tracks, fit, hands.mask)
-    evidence = gather(video, hands, fit, plane, costs)
+    evidence = gather(video, hands, tracks, fit, plane, costs)
     stray = contradicted(evidence, fit, plane)
     if 0.05 * len(stray) < stray.sum() <= len(stray) - 5:
         fit, plane = keep_points(fit, plane, ~stray)
-        evidence = gather(video, hands, fit, plane, costs)
+        evidence = gather(video, hands, tracks, fit, plane, costs)
     keys = spread_frames(fit, costs, KEY_FRAMES)
     cut, agreement = _cut_keys(video, hands, fit, plane, evidence, keys)
 

@@ -283,8 +283,8 @@ def _result(
     if verdict == "ok" and sure.axis_deg > VAGUE_DEG:
         verdict = "ambiguous"
         reason = (
-            f"{len(done.members)} tracks hold the axis to {sure.axis_deg:.0f} deg only; a longer motion, or more of the "
-            f"part in view, would tell; {how}{note}"
+            f"{len(done.members)} tracks hold the axis to {sure.axis_deg:.0f} deg only; a longer motion, or more of "
+            f"the part in view, would tell; {how}{note}"
         )
     std = {"axis_deg": sure.axis_deg, "point_m": sure.point, "q": sure.q,
            "focal_px": full_focal * (sure.log_focal if focal_std is None else focal_std)}  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -11,9 +12,10 @@ import trimesh
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, keep_clear, trim_parts
+from reconstruct.geometry.layers import make_chart, resting_cells, seed_polygon, warp_to_image
 from reconstruct.geometry.links import build_geometry
 from reconstruct.geometry.masks import segment_links
-from reconstruct.geometry.plane import fit_plane
+from reconstruct.geometry.plane import fit_plane, homography, working_matrix
 from reconstruct.geometry.solids import hull, swept_hulls, to_arrays
 from reconstruct.joint.models import JointFit
 from tests.reconstruct.geometry_scenes import make_scene
@@ -57,6 +59,30 @@ def test_masks_follow_the_link_and_leave_out_the_hand(door):
     assert not (masks.moving & masks.hand).any()
     assert not (masks.moving & masks.static).any()
     assert masks.confidence.shape == (len(scene.video),) and (masks.confidence <= 1).all()
+
+
+def test_points_seen_at_rest_lie_beside_the_link(door):
+    scene, _ = door
+    video, fit = scene.video, scene.fit
+    plane = fit_plane(scene.tracks, fit)
+    chart = make_chart(seed_polygon(fit, plane))
+    frames = np.arange(0, len(video), 4)
+    h, w = video.frames.shape[1:3]
+    y, x = np.mgrid[6 : h - 6 : 8, 6 : w - 6 : 8].reshape(2, -1)
+    # A grid of points at rest, seen where the link and the hand are not.
+    clear = ~np.stack([cv2.dilate((m | a).astype(np.uint8), np.ones((7, 7))) > 0
+                       for m, a in zip(scene.masks, scene.hands.mask, strict=True)])  # fmt: skip
+    visible = clear[:, y, x].T
+    uv = np.repeat(video.to_full(np.stack([x, y], -1).astype(float))[:, None], len(video), axis=1)
+    room = replace(scene.tracks, uv=np.where(visible[..., None], uv, np.nan), visible=visible)
+    cells = resting_cells(video, room, fit, plane, chart, frames)
+    H = working_matrix(video) @ homography(fit, plane, fit.q[frames])
+    drawn = np.stack([warp_to_image(chart, c, m, (w, h)) for c, m in zip(cells, H, strict=True)])
+    assert drawn.any((1, 2)).mean() > 0.8
+    assert (drawn & scene.masks[frames]).sum() < 0.03 * drawn.sum()
+    own = replace(scene.tracks, visible=scene.tracks.visible & np.isin(np.arange(len(scene.tracks.uv)),
+                                                                      fit.point_track)[:, None])  # fmt: skip
+    assert resting_cells(video, own, fit, plane, chart, frames).mean() < 0.001
 
 
 def test_the_moving_mesh_is_the_slab(door, door_geometry):
