@@ -24,9 +24,9 @@ MOVING_SHARE = 0.012
 MIN_INLIERS = 8
 SIMPLER = 1.05
 BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
-LOOSER = 4.0
-"""A joint is refuted if its own points follow a free body so many times better. Parts that flex, and a stabilised
-hand-held camera, stay under three."""
+LOOSER, RESTLESS = 4.0, 3.0
+"""A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
+what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
 VAGUE_DEG = 10.0
 """Standard deviation of an axis beyond which the joint is not called certain."""
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
@@ -96,7 +96,7 @@ def fit_joint(
 
     done = finish(found.starts, uv - camera.centre, found.members, view)
     tell(1.0)
-    if reason := _why_not_believed(done):
+    if reason := _why_not_believed(done, _restlessness(uv, camera)):
         return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
 
@@ -135,6 +135,15 @@ def _moving(uv: np.ndarray, camera: _Camera) -> np.ndarray:
     if some.any():
         extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
     return np.flatnonzero(extent > MOVING_SHARE * camera.diagonal)
+
+
+def _restlessness(uv: np.ndarray, camera: _Camera) -> float:
+    """Working px, RMS, by which tracks at rest leave their place in the median; infinite if there are none."""
+    rest = np.setdiff1d(np.flatnonzero(np.isfinite(uv[..., 0]).mean(1) > 0.5), _moving(uv, camera))
+    if not len(rest):
+        return np.inf
+    off = uv[rest] - np.nanmedian(uv[rest], axis=1)[:, None]
+    return float(np.median(np.sqrt(np.nanmean(off**2, axis=(1, 2)))))
 
 
 def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:
@@ -220,8 +229,12 @@ def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, 
     return _result(video, done, full_focal, tracks, note, KNOWN_STD if view.focal_std == 0 else None)
 
 
-def _why_not_believed(done: Finished) -> str | None:
-    """A sentence if the finished joint is not one."""
+def _why_not_believed(done: Finished, restlessness: float = np.inf) -> str | None:
+    """A sentence if the finished joint is not one.
+
+    Args:
+        restlessness: px, what points at rest leave their place by.
+    """
     turn = turn_deg(done.bundle)
     if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
         return (
@@ -236,7 +249,8 @@ def _why_not_believed(done: Finished) -> str | None:
             f"no joint: from one state to the next the best one ({done.bundle.kind}) misses {b.error:.0%} of the way "
             "that its own points go"
         )
-    times = looser(done.bundle, done.sight) if done.sight.R is None else None
+    misses = done.sight.R is None and done.bundle.sigma > RESTLESS * restlessness
+    times = looser(done.bundle, done.sight) if misses else None
     if times is not None and times > LOOSER:
         return (
             f"the part moves as a free body: its points follow one {times:.0f} times more exactly than the best joint "

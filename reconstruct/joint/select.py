@@ -231,8 +231,14 @@ def patch_states(obs: Observations, rng: np.random.Generator) -> list[State]:
             if (h := _hinge_of_path(R[keys], t[keys], keys)) is not None:
                 carried.append(extend(h, obs))
     carried.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
-    fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in carried[:PATCHES]]
+    fined = [_refined(s, obs) for s in carried[:PATCHES]]
     return sorted(fined, key=lambda s: -explained(s, obs)[0])
+
+
+def _refined(s: State, obs: Observations) -> State:
+    """The better of a wide and a narrow refinement: a wide one reaches further, but an arm's many tracks pull at it."""
+    both = [refine(s, obs, scales=scales, iterations=6) for scales in ((10.0, 5.0), (4.0, 2.0))]
+    return max(both, key=lambda r: explained(r, obs)[0])
 
 
 def _hinge_of_path(R: np.ndarray, t: np.ndarray, keys: np.ndarray) -> Hypothesis | None:
@@ -412,7 +418,7 @@ def _best_of(hyps: list[Hypothesis], obs: Observations, coarse: int, fine: int, 
         pool = sorted((h for h in hyps if h.kind == kind), key=lambda h: -h.score)[:coarse]
         states = [extend(h, obs) for h in pool]
         states.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
-        fined = [refine(s, obs, scales=(10.0, 5.0), iterations=6) for s in _distinct(states, fine)]
+        fined = [_refined(s, obs) for s in _distinct(states, fine)]
         fined += more if kind == "revolute" else []
         fined.sort(key=lambda s: -explained(s, obs)[0])
         last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
