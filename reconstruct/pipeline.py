@@ -306,7 +306,8 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
         return fit
     rest = replace(tracks, visible=tracks.visible & ~arm[:, None])
     again = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
-    return replace(again, reason=f"{again.reason}; what moved most was an arm, whose tracks are left out")
+    # No semicolon: what follows one is advice.
+    return replace(again, reason=f"without the arm that moved most, {again.reason}")
 
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,

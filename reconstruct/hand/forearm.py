@@ -18,6 +18,10 @@ def on_forearm(tracks: Tracks, hands: Hands) -> np.ndarray:
     """(N,) bool: tracks that stay where a forearm is, which prolongs a hand beyond its wrist.
 
     What lies behind an arm is seen only while the arm is elsewhere; what stays in the moving wedge is the arm itself.
+
+    Args:
+        tracks: (N, T) points, full px.
+        hands: of the same T frames; their landmarks in full px.
     """
     out = np.zeros(len(tracks.uv), bool)
     for hand in hands.tracks:

@@ -68,6 +68,9 @@ def looser(b: Bundle, s: Sightings) -> float | None:
 
     Six numbers a pose in place of one always fit a little better; that much is taken out. Before a resting camera.
 
+    Args:
+        b: the fitted joint.  s: its observations, (n, T).
+
     Returns:
         About 1 where the joint says all, or None if there are too few observations.
     """

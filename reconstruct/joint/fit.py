@@ -204,7 +204,7 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     if free is not None and free.unexplained > FREE_SHARE:
         return (
             f"the part moves as a free body, not about one joint: {free.unexplained:.0%} of its points that move most "
-            f"do not follow the best joint ({s.kind}; median residual {free.joint_px:.1f} px against "
+            f"do not follow the best joint ({s.kind}, median residual {free.joint_px:.1f} px against "
             f"{free.free_px:.1f} px for a free rigid body, working pixels)"
         )
     return None
@@ -239,7 +239,7 @@ def _why_not_believed(done: Finished, restlessness: float = np.inf) -> str | Non
     if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
         return (
             f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any "
-            f"body does that is carried a short way; a screw is believed from {SCREW_TURN_DEG:.0f} deg on"
+            f"body does that is carried a short way (a screw is believed from {SCREW_TURN_DEG:.0f} deg on)"
         )
     b = bridged(done.bundle, done.sight)
     if b.supported < BRIDGED_SHARE:
