@@ -52,6 +52,29 @@ def static(plant, table, q):
 
 
 @njit(cache=True)
+def catch(q, strength, place, width):
+    """Torque of a detent."""
+    x = q - place
+    if x * x >= 80.0 * width * width:
+        return 0.0
+    x /= width
+    return -strength * x * np.exp(0.5 - 0.5 * x * x)
+
+
+@njit(cache=True)
+def stopped(q, v, step, place, side, stiffness, damping):
+    """Torque of an end stop on the given side of the motion, over a step."""
+    deep = side * (q - place)
+    # The share of the step spent beyond the stop: the damper sets in at once, wherever in a step that is.
+    reach = 0.5 * abs(v) * step
+    if deep <= -reach:
+        return 0.0
+    share = 1.0 if deep >= reach else 0.5 + 0.5 * deep / reach
+    mean = deep if share >= 1.0 else share * reach  # depth, over that share
+    return -share * side * max(stiffness * mean + damping * side * v, 0.0)
+
+
+@njit(cache=True)
 def added(p, frame, spline, q, v, step):
     """Torque of the terms that is a smooth function of q and v, damping left out."""
     f = p[TORQUE]
@@ -60,32 +83,21 @@ def added(p, frame, spline, q, v, step):
     if p[G_SIN] != 0.0 or p[G_COS] != 0.0:
         f += p[G_SIN] * np.sin(q) + p[G_COS] * np.cos(q)
     if p[DETENT] != 0.0:
-        x = (q - p[DETENT_AT]) / p[DETENT_W]
-        if x * x < 80.0:
-            f -= p[DETENT] * x * np.exp(0.5 - 0.5 * x * x)
+        f += catch(q, p[DETENT], p[DETENT_AT], p[DETENT_W])
     if p[STOP_K] != 0.0 or p[STOP_D] != 0.0:
-        side = 1.0 if p[STOP] >= frame[F_MID] else -1.0
-        deep = side * (q - p[STOP])
-        # The share of the step spent beyond the stop: the damper sets in at once, wherever in a step that is.
-        reach = 0.5 * abs(v) * step
-        share = min(max(0.5 + 0.5 * deep / (reach + 1e-300), 0.0), 1.0)
-        if share > 0:
-            mean = deep if share >= 1.0 else share * reach  # depth, over that share
-            f -= share * side * max(p[STOP_K] * mean + p[STOP_D] * side * v, 0.0)
+        f += stopped(q, v, step, p[STOP], 1.0 if p[STOP] >= frame[F_MID] else -1.0, p[STOP_K], p[STOP_D])
     if len(spline) > 0:
         f += hat(q, frame[F_Q0], frame[F_Q1], spline[:KNOTS]) + hat(v, frame[F_V0], frame[F_V1], spline[KNOTS:])
     return f
 
 
 @njit(cache=True)
-def level(p, plant, v):
+def level(v, dry, stiction, stribeck):
     """Dry friction at speed |v|."""
-    rub = plant[P_DRY] + p[COULOMB]
-    if p[STICTION] != 0.0:
-        x = v / p[STRIBECK]
-        if x * x < 80.0:
-            rub += p[STICTION] * np.exp(-x * x)
-    return rub
+    if stiction != 0.0 and v * v < 80.0 * stribeck * stribeck:
+        x = v / stribeck
+        return dry + stiction * np.exp(-x * x)
+    return dry
 
 
 @njit(cache=True)
@@ -109,7 +121,7 @@ def needed(p, plant, table, frame, spline, q, v, a, out):
         f = static(plant, table, q[i]) + added(p, frame, spline, q[i], v[i], 0.0)
         speed = abs(v[i])
         f -= (plant[P_B1] + p[DAMPING]) * v[i] + (plant[P_B2] + p[DRAG]) * v[i] * speed + plant[P_B3] * v[i] ** 3
-        f -= level(p, plant, v[i]) * np.sign(v[i])
+        f -= level(v[i], plant[P_DRY] + p[COULOMB], p[STICTION], p[STRIBECK]) * np.sign(v[i])
         out[i] = (plant[P_INERTIA] + p[INERTIA]) * a[i] - f
 
 
@@ -133,18 +145,47 @@ def advance(p, plant, table, frame, spline, torque, step, q, v, Q, V):
     sine, cosine = plant[P_SIN] + p[G_SIN], plant[P_COS] + p[G_COS]
     stiffness = plant[P_K] + p[STIFFNESS]
     tabled = plant[P_TABLE] > 0
+    # Weights and springs of the joint and of the terms together: one sine and one cosine a step.
+    constant, swings = p[TORQUE] + p[SPRING] + p[STIFFNESS] * frame[F_MID], sine != 0.0 or cosine != 0.0
+    own_sine, own_cosine = p[G_SIN], p[G_COS]
+    if not tabled:
+        constant += plant[P_CONST] + plant[P_K] * plant[P_REF]
+        own_sine, own_cosine = sine, cosine
+    pull = p[STIFFNESS] if tabled else stiffness
+    curved = not tabled and (swings or stiffness != 0.0)
+    catching, stops = p[DETENT] != 0.0, p[STOP_K] != 0.0 or p[STOP_D] != 0.0
+    strength, catch_at, width, stop = p[DETENT], p[DETENT_AT], p[DETENT_W], p[STOP]
+    stop_k, stop_d = p[STOP_K], p[STOP_D]
+    dry, stiction, stribeck = plant[P_DRY] + p[COULOMB], p[STICTION], p[STRIBECK]
+    braked = b1 != 0.0 or b2 != 0.0 or b3 != 0.0
+    stop_side = 1.0 if p[STOP] >= frame[F_MID] else -1.0
+    inverse = 1.0 / inertia
+    over_q, over_v = spline[:KNOTS], spline[KNOTS:]
     Q[0], V[0] = q, v
     for k in range(len(torque)):
-        f = torque[k] + static(plant, table, q) + added(p, frame, spline, q, v, step)
-        if not tabled and (sine != 0.0 or cosine != 0.0 or stiffness != 0.0):
+        f = torque[k] + constant - pull * q
+        s, c = 0.0, 0.0
+        if swings:
             s, c = np.sin(q), np.cos(q)
+            f += own_sine * s + own_cosine * c
+        if tabled:
+            f += static(plant, table, q)
+        if catching:
+            f += catch(q, strength, catch_at, width)
+        if stops:
+            f += stopped(q, v, step, stop, stop_side, stop_k, stop_d)
+        if len(spline) > 0:
+            f += hat(q, frame[F_Q0], frame[F_Q1], over_q) + hat(v, frame[F_V0], frame[F_V1], over_v)
+        if curved:
             slope_q = sine * c - cosine * s - stiffness
-            f += numerov * (slope_q * f / inertia - (sine * s + cosine * c) * v * v)
-        speed = abs(v)
-        f -= b1 * v + b2 * v * speed + b3 * v * v * v
-        slope = b1 + 2 * b2 * speed + 3 * b3 * v * v
-        if p[STOP_D] != 0.0 and (q - p[STOP]) * (1.0 if p[STOP] >= frame[F_MID] else -1.0) > 0:
-            slope += p[STOP_D]
+            f += numerov * (slope_q * f * inverse - (sine * s + cosine * c) * v * v)
+        slope = 0.0
+        if braked:
+            speed = abs(v)
+            f -= v * (b1 + speed * (b2 + b3 * speed))
+            slope = b1 + speed * (2 * b2 + 3 * b3 * speed)
+        if stop_d != 0.0 and (q - stop) * stop_side > 0:
+            slope += stop_d
         if plant[P_LIMITED] > 0:
             for place, side in ((plant[P_HIGH], 1.0), (plant[P_LOW], -1.0)):
                 deep = side * (q - place)
@@ -152,14 +193,14 @@ def advance(p, plant, table, frame, spline, torque, step, q, v, Q, V):
                     push = soft * (f * side + inertia * (back * v * side + stiff * deep))
                     f -= side * max(push, 0.0)
         # Damping acts at the middle of the step; at its end (as MuJoCo has it) it would weigh as inertia b h / 2.
-        gain = step / max(inertia + 0.5 * step * slope, 0.1 * inertia)
+        gain = step / max(inertia + 0.5 * step * slope, 0.1 * inertia) if slope != 0.0 else step * inverse
         push = gain * f
         if rubbing:
             # Friction that depends on speed is that of the step's middle.
             middle = v + 0.5 * push
-            if p[STICTION] != 0.0:
-                middle = 0.5 * (v + rubbed(v, push, gain * level(p, plant, middle)))
-            v = rubbed(v, push, gain * level(p, plant, middle))
+            if stiction != 0.0:
+                middle = 0.5 * (v + rubbed(v, push, gain * level(middle, dry, stiction, stribeck)))
+            v = rubbed(v, push, gain * level(middle, dry, stiction, stribeck))
         else:
             v = v + push
         v = min(max(v, -fast), fast)

@@ -12,12 +12,14 @@ Integral (weak) regression of equations of motion: after Schaeffer and McCalla (
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
 
 from diagnose.causes import CAUSES
 from diagnose.fit import Fit, Problem, linearise
+from diagnose.integrals import freed, once, twice
 from diagnose.noise import Noise
 from diagnose.simulate import Episode
 
@@ -60,7 +62,7 @@ class Regression:
         ends = np.cumsum([0] + [len(e.t) for e in problem.episodes])
         self.parts = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         self.slope = (plant.static(m.q + 1e-5) - plant.static(m.q - 1e-5)) / 2e-5
-        self.lines: list[tuple[np.ndarray, np.ndarray]] = []  # rows and an orthonormal basis of each window's lines
+        self.lines: list[np.ndarray] = []  # an orthonormal basis of each window's lines, in the order of its rows
         self.rest = np.zeros(len(m.q), bool)  # rows that say nothing
         y = np.empty(len(m.q))
         if problem.driven:
@@ -68,12 +70,12 @@ class Regression:
             return
         for e, part in zip(problem.episodes, self.parts, strict=True):
             known = m.residual[part] + plant.inertia * m.a[part] - e.u
-            y[part] = e.log.q - (_twice(known, e.t) + _driven(e, e.torque)) / plant.inertia
+            y[part] = e.log.q - (twice(known, e.t) + _driven(e, e.torque)) / plant.inertia
             edges = [_driven(e, p) / plant.inertia for p in e.edges]
             for rows in self._windows(e, part):
                 t = e.t[rows] - e.t[rows].mean()
                 Q = np.linalg.qr(np.stack([np.ones(len(t)), t, *(x[rows] for x in edges)], axis=1))[0]
-                self.lines.append((rows + part.start, Q))
+                self.lines.append(Q)
         self.y = self._free(y)
 
     def _windows(self, e: Episode, part: slice) -> list[np.ndarray]:
@@ -96,11 +98,20 @@ class Regression:
         return out
 
     def _free(self, x: np.ndarray) -> np.ndarray:
-        out = x.copy()
-        out[self.rest] = 0.0
-        for rows, Q in self.lines:
-            out[rows] -= Q @ (Q.T @ x[rows])
-        return out
+        if not self.lines:
+            return x.copy()
+        table = x if x.ndim == 2 else x[:, None]
+        return freed(table, self.rest, *self._windowed).reshape(x.shape)
+
+    @cached_property
+    def _windowed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The lines as :func:`diagnose.integrals.freed` takes them."""
+        widths = np.array([Q.shape[1] for Q in self.lines])
+        starts = np.cumsum([0] + [len(Q) for Q in self.lines])
+        basis = np.zeros((starts[-1], widths.max()))
+        for a, Q in zip(starts, self.lines, strict=False):
+            basis[a : a + len(Q), : Q.shape[1]] = Q
+        return starts, widths, basis
 
     def columns(self, name: str, shape: dict[str, float]) -> tuple[tuple[str, ...], np.ndarray]:
         """Terms that a cause adds linearly in one shape, and their columns (N, terms)."""
@@ -119,11 +130,11 @@ class Regression:
                 if term == "inertia":
                     col = -e.log.q / plant.inertia
                 elif f is not None:
-                    col = -_twice(f[part], e.t) / plant.inertia
+                    col = -twice(f[part], e.t) / plant.inertia
                 if r is not None:
                     x = r[part]
-                    col = col + x - _twice(self.slope[part] * x, e.t) / plant.inertia
-                    col = col + plant.damping[0] / plant.inertia * _once(x, e.t)
+                    col = col + x - twice(self.slope[part] * x, e.t) / plant.inertia
+                    col = col + plant.damping[0] / plant.inertia * once(x, e.t)
                 out[part, k] = col
         return terms, self._free(out)
 
@@ -171,15 +182,6 @@ class Regression:
         simplex = np.concatenate([start[None], start + 0.3 * np.eye(len(start))])
         minimize(left, start, method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": 25 * len(start)})
         return best[0]
-
-
-def _once(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Integral of x (N,) over t (N,), trapezoids."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t))])
-
-
-def _twice(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-    return _once(_once(x, t), t)
 
 
 def _driven(e: Episode, torque: np.ndarray) -> np.ndarray:
