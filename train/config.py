@@ -26,6 +26,8 @@ class Config:
         evaluate_every, evaluate_episodes, enough: environment steps between evaluations without exploration (0: none),
             episodes of one (of an imperfect policy's, 32), and the success at which training ends.
         anneal_to, anneal_steps: PPO's log standard deviation is held below a line to this value at so many steps.
+        guide_episodes: draws in which PPO on residual actions first imitates a guide, see :mod:`train.guide`; 0: none,
+            nor where ``steps`` has no room for it.
         algorithm, policy: arguments of the Stable-Baselines3 class and of its policy.
     """
 
@@ -42,6 +44,7 @@ class Config:
     enough: float = 1.0
     anneal_to: float | None = None
     anneal_steps: int = 100_000
+    guide_episodes: int = 0
     seed: int = 0
     algorithm: Mapping[str, Any] = field(default_factory=dict)
     policy: Mapping[str, Any] = field(default_factory=dict)
@@ -69,7 +72,7 @@ def load_config(algo: str = "ppo", file: Path | None = None, **changes: Any) -> 
         raise TaaEnvsError(f"{file} does not hold training settings ({reason}); copy one of train/configs") from None
     for name, least, most in (("envs", 1, 65_536), ("steps", 1, 10**12), ("checkpoint_every", 1, 10**12),
                               ("evaluate_every", 0, 10**12), ("evaluate_episodes", 1, 10**6),
-                              ("anneal_steps", 1, 10**12)):  # fmt: skip
+                              ("anneal_steps", 1, 10**12), ("guide_episodes", 0, 65_536)):  # fmt: skip
         value = getattr(made, name)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
             raise TaaEnvsError(f"{name} must be a whole number from {least} to {most}, is {str(value)[:40]}; "
@@ -80,4 +83,7 @@ def load_config(algo: str = "ppo", file: Path | None = None, **changes: Any) -> 
         if not isinstance(getattr(made, name), kinds):
             words = " or ".join(k.__name__ for k in kinds)
             raise TaaEnvsError(f"{name} must be {words}, is {str(getattr(made, name))[:40]!r}; mend {file}")
+    if made.guide_episodes and (made.algo, made.action) != ("ppo", "residual"):
+        raise TaaEnvsError("a guide teaches PPO on residual actions only, not "
+                           f"{made.algo.upper()} on {made.action} ones; set guide_episodes = 0 in {file}")
     return made

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,21 @@ from train.vec import CLIP, Normal
 
 FORMAT = "taa-policy/2"
 CLASSES: dict[str, Any] = {"ppo": PPO, "sac": SAC}
+ACTIVATIONS = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}
+
+
+def policy_arguments(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings' table [policy] as Stable-Baselines3 takes it: ``activation_fn`` is a name there.
+
+    Raises:
+        ValueError: no activation has that name.
+    """
+    name = settings.get("activation_fn")
+    if name is None:
+        return dict(settings)
+    if name not in ACTIVATIONS:
+        raise ValueError(f"no activation_fn is named {str(name)[:40]!r}, known are {' and '.join(ACTIVATIONS)}")
+    return {**settings, "activation_fn": ACTIVATIONS[name]}
 
 
 def tensors(value: Any) -> Any:
@@ -118,7 +134,7 @@ def load_policy(file: str | os.PathLike) -> tuple[Policy, dict[str, Any]]:
         made = CLASSES[content["algo"]].policy_aliases["MlpPolicy"](
             spaces.Box(-CLIP, CLIP, (content["observation_size"],), np.float32),
             spaces.Box(-1.0, 1.0, (content["action_size"],), np.float32), lambda _: 0.0,
-            use_sde=content["use_sde"], **content["policy"])
+            use_sde=content["use_sde"], **policy_arguments(content["policy"]))
         made.load_state_dict(content["weights"])
         made.set_training_mode(False)
         policy = Policy(made, Normal(content["mean"].numpy(), content["std"].numpy()), int(content["hold"]))

@@ -35,7 +35,8 @@ from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config
 from train.evaluate import episodes as run_episodes
 from train.evaluate import make_env
-from train.policy import CLASSES, Policy, arrays, load_torch, save_policy, save_torch, tensors
+from train.guide import most_steps, teach
+from train.policy import CLASSES, Policy, arrays, load_torch, policy_arguments, save_policy, save_torch, tensors
 from train.vec import BatchedVecEnv, Normal, replay_normal
 
 FORMAT = "taa-checkpoint/2"
@@ -92,11 +93,13 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
             policy is evaluated without exploration now and then, before the first step too; the best one is kept, and
             training ends where one does well ``enough``.
         folder: the run's, made if missing.
-        minutes: stop after so many by the clock, those before a kill counted in; the run can go on later.
+        minutes: stop after so many by the clock, those before a kill counted in, but not amid the guide's lessons; the
+            run can go on later.
         progress: called after every iteration with the share done and the curve's row.
 
     Returns:
-        run (path), policy (path), resumed_at (steps), steps, and the curve's last success, return, progress, evaluated
+        run (path), policy (path), resumed_at (steps), steps, guided (whether a guide was imitated first, unless nothing
+        was trained), and the curve's last success, return, progress, evaluated
         (success without exploration), seconds by the clock and of the processor.
 
     Raises:
@@ -115,9 +118,9 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     torch.set_num_threads(1)  # small networks: threads cost more than they bring, and results depend on them
     kind = CLASSES[config.algo]
     try:
-        model = kind("MlpPolicy", env, policy_kwargs=dict(config.policy), seed=config.seed, device="cpu", verbose=0,
-                     **config.algorithm)
-    except TypeError as error:
+        model = kind("MlpPolicy", env, policy_kwargs=policy_arguments(config.policy), seed=config.seed, device="cpu",
+                     verbose=0, **config.algorithm)
+    except (TypeError, ValueError) as error:
         raise TaaEnvsError(f"the settings do not fit Stable-Baselines3's {kind.__name__} ({error}); mend them"
                            ) from None
     model.set_logger(_logger(folder))
@@ -134,9 +137,15 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         _write_results(folder, model, best, normal, config, asset, rows)
     begin, begin_used, saved, made = time.monotonic() - seconds, time.process_time() - used, resumed, resumed
     judge = _Judge(asset, config, normal)
+    # Where so few steps are asked for that the guide would take them all, there is none.
+    guided = config.guide_episodes > 0 and most_steps(config, batch.max_episode_steps) <= config.steps
     over = made >= config.steps or (bool(rows) and rows[-1][EVALUATED] >= config.enough)
     while not over:
-        if rows or not config.evaluate_every:  # else the untrained policy is evaluated first: PPO's is the replay
+        if len(rows) < (config.evaluate_every > 0):
+            pass  # the untrained policy is evaluated first: PPO's is the replay
+        elif guided and made == 0:
+            model.num_timesteps = teach(model, asset, config, normal) // config.hold
+        else:
             _quieten(model, config, made)
             # The first call resets the environments, the others go on.
             model.learn(chunk, callback=episodes, reset_num_timesteps=model.num_timesteps == 0, log_interval=None)
@@ -163,7 +172,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     judge.close()
     last = dict(zip(COLUMNS, rows[-1], strict=True)) if rows else {}
     return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
-            "steps": made,
+            "steps": made, "guided": guided,
             **{k: None if np.isnan(last[k]) else last[k] for k in COLUMNS[2:] if k in last}}
 
 

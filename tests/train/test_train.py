@@ -21,6 +21,7 @@ from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config, load_config
 from train.evaluate import episodes, evaluate
 from train.film import record
+from train.guide import Way
 from train.policy import load_policy
 from train.run import train
 from train.vec import BatchedVecEnv
@@ -29,6 +30,8 @@ PPO = Config(algo="ppo", envs=2, steps=1024, checkpoint_every=256, hold=2, algor
              "n_epochs": 2}, policy={"net_arch": [16]})
 SAC = Config(algo="sac", envs=2, steps=600, checkpoint_every=200, hold=2, algorithm={"buffer_size": 500,
              "learning_starts": 50, "batch_size": 16, "gradient_steps": 1}, policy={"net_arch": [16]})
+GUIDED = Config(**{**PPO.as_dict(), "steps": 4000, "guide_episodes": 2, "evaluate_every": 500, "evaluate_episodes": 2,
+                   "enough": 2.0, "policy": {"net_arch": [16], "activation_fn": "relu"}})
 
 
 class Killed(Exception):
@@ -42,11 +45,13 @@ def curve(folder: Path) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("config", [Config(**{**PPO.as_dict(), "evaluate_every": 500, "evaluate_episodes": 2,
-                                              "enough": 2.0, "anneal_to": -1.0, "anneal_steps": 800}), SAC],
-                         ids=["ppo", "sac"])
+                                              "enough": 2.0, "anneal_to": -1.0, "anneal_steps": 800}),
+                                    GUIDED, SAC], ids=["ppo", "guided", "sac"])
 def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp_path: Path,
                                                 monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("train.run.CHUNK", 200)
+    for name, value in (("TRIALS", 1), ("WAYS", (Way(0.0, 0.02),)), ("ROUNDS", 1), ("EPOCHS", 3)):
+        monkeypatch.setattr(f"train.guide.{name}", value)
     whole = train(door, config, tmp_path / "whole")
     assert whole["resumed_at"] == 0 and whole["steps"] >= config.steps
 
