@@ -98,8 +98,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         progress: called after every iteration with the share done and the curve's row.
 
     Returns:
-        run (path), policy (path), resumed_at (steps), steps, guided (whether a guide was imitated first, unless nothing
-        was trained), and the curve's last success, return, progress, evaluated
+        run (path), policy (path), resumed_at (steps), steps, guided (whether a guide was imitated first), and the curve's last success, return, progress, evaluated
         (success without exploration), seconds by the clock and of the processor.
 
     Raises:
@@ -137,13 +136,15 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         _write_results(folder, model, best, normal, config, asset, rows)
     begin, begin_used, saved, made = time.monotonic() - seconds, time.process_time() - used, resumed, resumed
     judge = _Judge(asset, config, normal)
+    guided = content is not None and content["guided"]
     # Where so few steps are asked for that the guide would take them all, there is none.
-    guided = config.guide_episodes > 0 and most_steps(config, batch.max_episode_steps) <= config.steps
+    to_guide = config.guide_episodes > 0 and most_steps(config, batch.max_episode_steps) <= config.steps
     over = made >= config.steps or (bool(rows) and rows[-1][EVALUATED] >= config.enough)
     while not over:
         if len(rows) < (config.evaluate_every > 0):
             pass  # the untrained policy is evaluated first: PPO's is the replay
-        elif guided and made == 0:
+        elif to_guide and made == 0:
+            guided = True
             model.num_timesteps = teach(model, asset, config, normal) // config.hold
         else:
             _quieten(model, config, made)
@@ -165,7 +166,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         over = (made >= config.steps or evaluated >= config.enough
                 or (minutes is not None and time.monotonic() - begin >= 60 * minutes))
         if made - saved >= config.checkpoint_every or over:
-            save_torch(checkpoint, {**_checkpoint(model, env, normal, episodes, rows), "best": best})
+            save_torch(checkpoint, {**_checkpoint(model, env, normal, episodes, rows), "best": best, "guided": guided})
             _write_results(folder, model, best, normal, config, asset, rows)
             saved = made
     env.close()

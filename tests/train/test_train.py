@@ -64,6 +64,7 @@ def test_a_killed_run_goes_on_to_the_same_curve(config: Config, door: Asset, tmp
     np.random.default_rng(0).random(3), torch.rand(5)  # other generators' states do not matter
     again = train(door, config, tmp_path / "killed")
     assert 0 < again["resumed_at"] < config.steps
+    assert again["guided"] is whole["guided"] is (config is GUIDED)
     assert curve(tmp_path / "killed") == curve(tmp_path / "whole") and len(curve(tmp_path / "whole")) > 3
     a, b = (load_policy(tmp_path / name)[0].network.state_dict() for name in ("whole", "killed"))
     assert all(torch.equal(a[key], b[key]) for key in a)
