@@ -98,8 +98,9 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         progress: called after every iteration with the share done and the curve's row.
 
     Returns:
-        run (path), policy (path), resumed_at (steps), steps, guided (whether a guide was imitated first), and the curve's last success, return, progress, evaluated
-        (success without exploration), seconds by the clock and of the processor.
+        run (path), policy (path), resumed_at (steps), steps, guided (whether a guide was imitated first), and the
+        curve's last success, return, progress, evaluated (success without exploration), seconds by the clock and of the
+        processor.
 
     Raises:
         TaaEnvsError: the folder holds a run with other settings, or something else.
