@@ -99,9 +99,10 @@ def page(entries: Sequence[Entry], command: str, figure: str | None, film: tuple
              "Stable-Baselines3 of the lock file.", "", table(entries), ""]
     if figure is not None:
         lines += [f"![Success in training over environment steps, a line a seed.]({figure})", "",
-                  "*Lines: with the noise that training explores with, over 100 episodes (each counted once all that "
-                  "began with it have ended). Dots: evaluations without noise, the last of which ends the training "
-                  "when it is perfect; its episodes are not those of the table. Dashed: the replay.*", ""]
+                  "*Dots: evaluations without noise, in episodes that are not the table's: the first is the replay, "
+                  "the second the policy after its guide's lessons (nothing is evaluated in between), and a perfect "
+                  "one ends the training. Lines: with the noise that training explores with, over 100 episodes (each "
+                  "counted once all that began with it have ended). Dashed: the replay in the table's episodes.*", ""]
     if film is not None:
         lines += [f"![Two rows of five moments of one episode.]({film[0]})", "",
                   f"*`{film[1]}`, one drawn episode (seed {film[2]}): the policy above, the open-loop replay below, "
