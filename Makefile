@@ -8,6 +8,7 @@ TORCH ?= torch==2.13.0
 TORCH_FROM ?=
 BIN := .venv/bin
 DEMO := demo
+WORKERS ?= 2
 
 export MUJOCO_GL ?= egl
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -35,8 +36,9 @@ demo: install
 	cp $(DEMO)/assets/demo/report.html $(DEMO)/report.html
 	@echo "open $(DEMO)/report.html (the report) and $(DEMO)/replay.mp4 (video and replay side by side)"
 
+# Two processes of one thread each: the suite is made of many short simulations and fits.
 test: install
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 
 # The assets that ship, from clips that are rendered here; under an hour on two cores.
 assets: install
