@@ -129,21 +129,27 @@ def _register(grey: list[np.ndarray], reference: int) -> _Registration | None:
 def _without_jumps(H: np.ndarray, good: np.ndarray, size: tuple[int, int], reach: int = 4) -> np.ndarray:
     """Homographies with missing frames and single-frame jumps replaced: cameras in hands do not jump and come back.
 
-    Works on where four inner picture points go, (T, 4, 2): a frame that is farther than 3 px from the median of its
-    neighbours counts as missing, and missing frames are interpolated in time.
+    Works on where four inner picture points go, (T, 4, 2): a frame that is farther than 3 px, and farther than three
+    times what its neighbours leave, from the parabola through them counts as missing, and missing frames are
+    interpolated in time.
     """
     import cv2
 
     h, w = size
     corners = np.float32([[[0.2 * w, 0.2 * h], [0.8 * w, 0.2 * h], [0.8 * w, 0.8 * h], [0.2 * w, 0.8 * h]]])
     path = np.stack([cv2.perspectiveTransform(corners, M)[0] for M in H]).astype(float)
-    good = good.copy()
     T = len(H)
+    flat, jump = path.reshape(T, -1), np.zeros(T, bool)
     for t in range(T):
-        near = [k for k in range(max(0, t - reach), min(T, t + reach + 1)) if k != t and good[k]]
-        if len(near) >= 3 and np.linalg.norm(path[t] - np.median(path[near], axis=0), axis=-1).max() > 3.0:
-            slope = np.abs(np.diff(path[near], axis=0)).max()
-            good[t] &= slope > 3.0  # fast but steady motion is no jump
+        near = np.array([k for k in range(max(0, t - reach), min(T, t + reach + 1)) if k != t and good[k]], int)
+        if len(near) < 4:
+            continue
+        powers = np.vander(np.append(near, t) - t, 3).astype(float)
+        fitted = powers @ np.linalg.lstsq(powers[:-1], flat[near], rcond=None)[0]
+        left = np.linalg.norm((flat[near] - fitted[:-1]).reshape(len(near), 4, 2), axis=-1).max(1)
+        off = np.linalg.norm((flat[t] - fitted[-1]).reshape(4, 2), axis=-1).max()
+        jump[t] = off > max(3.0, 3.0 * np.median(left))
+    good = good & ~jump
     filled = path.copy()
     known = np.flatnonzero(good)
     for i in range(4):
@@ -171,16 +177,16 @@ def stabilise(video: Video, scratch: Path | None = None, seed: int = 0) -> tuple
     out = np.lib.format.open_memmap(where / "frames_stable.npy", mode="w+", dtype=np.uint8, shape=video.frames.shape)
     for t in range(T):
         out[t] = _warp(video.frames[t], motion.H[t])
-    # The dominant plane may be far behind the object. A second, affine correction follows the static points
-    # around the place where things happen, which is where the joint is.
+    # The dominant plane may be far behind the object. A second, affine correction follows the static points that the
+    # object stands among.
     local = _local_correction(out, video.diagonal * video.scale)
-    H = local @ motion.H
+    H = _without_jumps(local @ motion.H, np.ones(T, bool), (h, w))
     for t in range(T):
         out[t] = _warp(video.frames[t], H[t])
     motion = replace(motion, H=H)
     out.flush()
     note = f"camera drifts by up to {motion.drift_px.max() / video.scale:.1f} px; compensated by homographies"
-    return video.with_frames(out, note), motion
+    return replace(video.with_frames(out, note), stabilised=True), motion
 
 
 def _warp(image: np.ndarray, H: np.ndarray) -> np.ndarray:
@@ -190,18 +196,37 @@ def _warp(image: np.ndarray, H: np.ndarray) -> np.ndarray:
     return cv2.warpPerspective(image, H, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
+FOOT = 0.95
+"""Share of the picture's activity above the place that the local correction is made for. What moves reaches up before
+the room behind it; the static link and what it stands on, at about the object's depth, lie at its lower end."""
+REACH, REACH_UP = 0.15, 0.05
+"""Standard deviations of that place to the sides and down, and up, where the room behind may show; shares of the
+diagonal."""
+NARROWING = (8.0, 4.0, 2.0, 1.0, 0.7, 0.7)
+"""Scales of the robust weights in turn, px. Points near the object may go 10 px against the dominant plane; begun with
+the last scale they count as outliers, and the correction follows the wall."""
+
+
+def _foot_of_activity(frames: np.ndarray) -> np.ndarray:
+    """(2,) px: the lower end of where the picture changes."""
+    import cv2
+
+    small = [cv2.resize(f, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.int16) for f in frames]
+    energy = sum(np.clip(np.abs(b - a).max(axis=-1) - 24, 0, 60) for a, b in zip(small[:-1], small[1:], strict=True))
+    mass = cv2.GaussianBlur(energy.astype(np.float32), (0, 0), 3).astype(float) ** 2 + 1e-9
+    rows = np.cumsum(mass.sum(1))
+    y = int(np.searchsorted(rows, FOOT * rows[-1]))
+    half = max(1, len(mass) // 14)
+    band = mass[max(0, y - half) : y + half].sum(0)
+    return 4.0 * np.array([band @ np.arange(len(band)) / band.sum(), y])
+
+
 def _local_correction(frames: np.ndarray, diagonal: float) -> np.ndarray:
-    """(T, 3, 3) affine corrections from nearly static points, weighted by closeness to the picture's activity."""
+    """(T, 3, 3) affine corrections from nearly static points, weighted by closeness to the activity's foot."""
     import cv2
 
     T = len(frames)
-    small = [cv2.resize(f, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.int16) for f in frames]
-    energy = sum(np.clip(np.abs(b - a).max(axis=-1) - 24, 0, 60) for a, b in zip(small[:-1], small[1:], strict=True))
-    energy = cv2.GaussianBlur(energy.astype(np.float32), (0, 0), 3)
-    yx = np.stack(np.nonzero(energy >= 0), axis=-1)
-    mass = energy.ravel() ** 2
-    centre = 4 * (yx * mass[:, None]).sum(0)[::-1] / (mass.sum() + 1e-9)
-
+    centre = _foot_of_activity(frames)
     grey0 = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)
     points = _grid_corners(grey0, per_cell=8)
     where = np.full((T, len(points), 2), np.nan, np.float32)
@@ -221,18 +246,19 @@ def _local_correction(frames: np.ndarray, diagonal: float) -> np.ndarray:
     if steady.sum() < 12:
         return out
     x, target = where[:, steady].astype(float), points[steady, 0].astype(float)
-    near = np.exp(-0.5 * (np.linalg.norm(target - centre, axis=-1) / (0.2 * diagonal)) ** 2) + 1e-3
+    off = (target - centre) / (diagonal * REACH)
+    off[:, 1] *= np.where(off[:, 1] < 0, REACH / REACH_UP, 1.0)
+    near = np.exp(-0.5 * np.sum(off**2, axis=1)) + 1e-3
+    # A weak pull to the identity keeps the far corners of the image where they are.
+    ridge = np.diag([0.03 * diagonal] * 2 + [0.3])
+    M = np.eye(3)[:, :2]
     for t in range(1, T):
         seen = np.isfinite(x[t, :, 0])
-        a, b, w = np.c_[x[t, seen], np.ones(seen.sum())], target[seen], near[seen].copy()
-        M = None
-        for _ in range(6):
-            sw = np.sqrt(w)[:, None]
-            # A weak pull to the identity keeps the far corners of the image where they are.
-            ridge = np.diag([0.03 * diagonal] * 2 + [0.3])
-            M = np.linalg.lstsq(np.r_[a * sw, ridge], np.r_[b * sw, ridge @ np.eye(3)[:, :2]], rcond=None)[0]
+        a, b = np.c_[x[t, seen], np.ones(seen.sum())], target[seen]
+        for scale in NARROWING:  # from where the frame before it went
             r = np.linalg.norm(a @ M - b, axis=-1)
-            w = near[seen] / (1 + (r / 0.7) ** 2) ** 2
+            sw = np.sqrt(near[seen] / (1 + (r / scale) ** 2) ** 2)[:, None]
+            M = np.linalg.lstsq(np.r_[a * sw, ridge], np.r_[b * sw, ridge @ np.eye(3)[:, :2]], rcond=None)[0]
         out[t, :2] = M.T
     return out
 

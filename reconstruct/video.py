@@ -48,6 +48,7 @@ class Video:
         scale: working px per full px.
         focal_px: focal length from metadata, full px, or None.
         notes: what was odd about the file (corrupt frames, odd times), for the report.
+        stabilised: whether the frames are those of a moving camera, warped to its first view.
     """
 
     path: Path
@@ -60,6 +61,7 @@ class Video:
     scale: float
     focal_px: float | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
+    stabilised: bool = False
 
     def __len__(self) -> int:
         return len(self.time)

@@ -122,12 +122,14 @@ class View:
     Attributes:
         focal: px.  focal_std: of its logarithm, 0 where it is known.
         R, t: (T, 3, 3), (T, 3) world to camera; None for a static camera.
+        restless: px by which points at rest leave their place before a camera that was made static; 0 where it was.
     """
 
     focal: float
     focal_std: float = 0.0
     R: np.ndarray | None = None
     t: np.ndarray | None = None
+    restless: float = 0.0
 
     def sightings(self, uv: np.ndarray, frames: np.ndarray, lasting: float = 1.0) -> Sightings:
         """Of tracks (n, T, 2) in some frames."""
@@ -187,7 +189,7 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
         best = {kind: polish(b, sight) for kind, b in best.items()}
     else:
         best, sight = _together(_across_kinds(best, sight), sight, uv, still, view)
-    sight = _errors(best, sight)
+    sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
     probability = type_probabilities(best, sight)
     if probability.get("screw", 1.0) < NO_SCREW:
@@ -212,7 +214,7 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     else:
         rest = Still(np.setdiff1d(still.ids, members), still.X[~np.isin(still.ids, members)])
         best, few = _together(best, few, uv, rest, view)
-    few = _errors(best, few)
+    few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
     probability = type_probabilities(best, few)
     last = best[_winner(probability)]
@@ -231,7 +233,7 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     return Finished(b, every, members, sure, probability, view)
 
 
-def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
+def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sightings:
     """The sightings with what their errors are like: strayed stretches gone, how long errors last, and weights.
 
     Errors are judged by the type that fits best. A stretch has strayed if it leaves every type's points: what only the
@@ -256,8 +258,9 @@ def _errors(best: dict[str, Bundle], sight: Sightings) -> Sightings:
             for other, scale in others:
                 lost[body] &= strayed(other[body], sight.seen[body], scale, lasting)
         sight = replace(sight, seen=sight.seen & ~lost, lasting=lasting)
-    # Errors that neighbours share are no noise: they stay for as long as the tracks do.
-    alike = FLEX_PX**2 * rho * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2
+    # Errors that neighbours share are no noise: they stay for as long as the tracks do. So does what the compensation
+    # of a moving camera leaves, which the joint may take up until no residual shows it.
+    alike = (FLEX_PX**2 * rho + restless**2) * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2
     return replace(sight, weight=shared_weights(rho, cluster), lasting=max(sight.lasting, alike))
 
 

@@ -27,6 +27,9 @@ BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
 LOOSER, RESTLESS = 4.0, 3.0
 """A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
 what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
+DEPTHS = 0.68
+"""What the compensation of a moving camera leaves depends on the depth, and the link's own is not known: it is taken to
+be what this share of the resting points stays under, one standard deviation."""
 VAGUE_DEG = 10.0
 """Standard deviation of an axis beyond which the joint is not called certain."""
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
@@ -94,9 +97,11 @@ def fit_joint(
         return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members))
     tell(0.9)
 
+    restless = _restlessness(uv, camera, DEPTHS if video.stabilised else 0.5)
+    view = replace(view, restless=restless if video.stabilised and np.isfinite(restless) else 0.0)
     done = finish(found.starts, uv - camera.centre, found.members, view)
     tell(1.0)
-    if reason := _why_not_believed(done, _restlessness(uv, camera)):
+    if reason := _why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
 
@@ -137,13 +142,13 @@ def _moving(uv: np.ndarray, camera: _Camera) -> np.ndarray:
     return np.flatnonzero(extent > MOVING_SHARE * camera.diagonal)
 
 
-def _restlessness(uv: np.ndarray, camera: _Camera) -> float:
-    """Working px, RMS, by which tracks at rest leave their place in the median; infinite if there are none."""
+def _restlessness(uv: np.ndarray, camera: _Camera, share: float) -> float:
+    """Working px, RMS, by which a share of the tracks at rest leave their place at most; infinite if there are none."""
     rest = np.setdiff1d(np.flatnonzero(np.isfinite(uv[..., 0]).mean(1) > 0.5), _moving(uv, camera))
     if not len(rest):
         return np.inf
     off = uv[rest] - np.nanmedian(uv[rest], axis=1)[:, None]
-    return float(np.median(np.sqrt(np.nanmean(off**2, axis=(1, 2)))))
+    return float(np.quantile(np.sqrt(np.nanmean(off**2, axis=(1, 2))), share))
 
 
 def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from reconstruct.errors import TaaError
-from reconstruct.motion import estimate_camera_motion, stabilise
+from reconstruct.motion import _without_jumps, estimate_camera_motion, stabilise
 from tests.reconstruct.joint_scenes import make_video
 
 
@@ -55,6 +55,44 @@ def test_drift_is_removed(tmp_path):
     back = cv2.perspectiveTransform(moved, motion.H[-1])
     assert np.linalg.norm(back - p) < 0.5
     assert any("drifts" in n for n in stable.notes)
+
+
+def test_what_the_object_stands_on_rests_though_the_wall_behind_dominates(tmp_path):
+    """A travelling camera moves a desk against the wall; something swings up before the wall."""
+    w, h, foot, T = 720, 540, 450, 24
+    wall, desk = (cv2.resize(texture(seed), (960, 720)) for seed in (2, 3))
+    desk[:, :260], desk[:, 560:] = 128, 128  # plain but for the object's own place
+    frames, passed = [], 0.35 * np.arange(T)  # px by which the desk passes the wall
+    for t in range(T):
+        view = np.array([[1, 0, -0.5 * t], [0, 1, 0]])
+        frame = cv2.warpAffine(wall, view, (w, h))
+        view[0, 2] -= passed[t]
+        frame[foot:] = cv2.warpAffine(desk, view, (w, h))[foot:]
+        hinge = np.array([400 + view[0, 2], foot])
+        tip = hinge + 340 * np.array([np.cos(0.3 + 0.05 * t), -np.sin(0.3 + 0.05 * t)])
+        cv2.line(frame, tuple(hinge.astype(int)), tuple(tip.astype(int)), (20, 20, 20), 24)
+        frames.append(frame)
+    _, motion = stabilise(as_video(np.stack(frames), tmp_path))
+    assert not motion.static
+    here = np.array([400.0, 490.0])
+    off = [
+        np.linalg.norm(cv2.perspectiveTransform((here - [0.5 * t + passed[t], 0])[None, None], motion.H[t]) - here)
+        for t in range(T)
+    ]
+    assert np.quantile(off, 0.9) < 1.0
+
+
+def test_a_jump_is_mended_and_a_steady_pan_is_none():
+    """A hand that starts to turn at once moves the picture by a few px a frame from the first on."""
+    T = 30
+    pan = np.tile(np.eye(3), (T, 1, 1))
+    pan[:, 0, 2], pan[:, 1, 2] = 2.0 * np.arange(T), -1.5 * np.arange(T) + 12 * np.sin(0.4 * np.arange(T))
+    every = np.ones(T, bool)
+    assert np.array_equal(_without_jumps(pan, every, (360, 480)), pan)
+    jumped = pan.copy()
+    jumped[11, 0, 2] += 15
+    mended = _without_jumps(jumped, every, (360, 480))
+    assert np.abs(mended - pan)[:, :2, 2].max() < 2.0
 
 
 def test_cut_is_one_clear_line(tmp_path):
