@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,15 +152,15 @@ class View:
         return replace(self, R=R, t=-np.einsum("tij,tj->ti", R, centre))
 
 
-Starts = Mapping[str, tuple[State, Observations] | Bundle]
+Starts = Mapping[str, Sequence[tuple[State, Observations] | Bundle]]
 
 
 def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: Still | None = None) -> Finished:
     """Polish every type on the same tracks and decide between them.
 
     Args:
-        starts: per type, a state with depths of the tracks `ids` and their key-frame observations, or a bundle of these
-            tracks in all frames.
+        starts: per type, states with depths of the tracks `ids` and their key-frame observations, or bundles of these
+            tracks in all frames. The one that fits best after polishing counts.
         uv: (N, T, 2) px from the principal point, NaN where not seen.
         ids: (n,) tracks that the answer is fitted to.
         view: focal length and camera.
@@ -173,10 +173,13 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
     sight = view.sightings(uv[ids[pick]], some, lasting=100.0)
     best: dict[str, Bundle] = {}
-    for kind, start in starts.items():
-        b = start if isinstance(start, Bundle) else bundle_of_state(*start, some)
-        q = b.q[some] if len(b.q) > len(some) else b.q
-        best[kind] = polish(replace(b, X=b.X[pick], q=q - q[0]), sight)
+    for kind, several in starts.items():
+        tried = []
+        for start in several:
+            b = start if isinstance(start, Bundle) else bundle_of_state(*start, some)
+            q = b.q[some] if len(b.q) > len(some) else b.q
+            tried.append(polish(replace(b, X=b.X[pick], q=q - q[0]), sight))
+        best[kind] = min(tried, key=lambda b: b.cost)
     # Tracks that make sense as points of one link, by every type if these are nearly all of them.
     sane = [compact(b.X) & (b.X[:, 2] > 0) for b in best.values()]
     keep = np.logical_and.reduce(sane)

@@ -15,7 +15,7 @@ from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Still, View, fini
 from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
-from reconstruct.joint.select import explained, key_frames, motion_stretches, observations, search
+from reconstruct.joint.select import distinct, explained, key_frames, motion_stretches, observations, search
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 
@@ -23,6 +23,8 @@ MOVING_SHARE = 0.012
 """A track moves if its extent exceeds this share of the image diagonal."""
 MIN_INLIERS = 8
 SIMPLER = 1.05
+RIVAL, RIVALS = 0.9, 4
+"""Hinges that explain this share of what the best one does are polished too, so many at most."""
 BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
 LOOSER, RESTLESS = 4.0, 3.0
 """A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
@@ -120,13 +122,13 @@ class _Consensus:
     """The best joint of both types and the tracks that follow it, or why there is none.
 
     Attributes:
-        starts: per type, a state with depths of the following tracks, and their key-frame observations.
+        starts: per type, states with depths of the following tracks, and their key-frame observations; best first.
         members: (n,) indices of these tracks.
         explained: motion of all tracks that it explains.
         refusal: a sentence, or "".  scattered: True if too few tracks agree on anything.
     """
 
-    starts: dict[str, tuple[State, Observations]] = field(default_factory=dict)
+    starts: dict[str, list[tuple[State, Observations]]] = field(default_factory=dict)
     members: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     explained: float = 0.0
     refusal: str = ""
@@ -162,8 +164,9 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
     obs, _ = observations(uv[moving], focal, centre, keys, 260, rng, diagonal)
     if len(obs.ref) < MIN_INLIERS:
         return _Consensus(refusal=f"only {len(obs.ref)} moving tracks last long enough")
+    ranked = search(obs, rng, progress=lambda x: tell(0.9 * x))
     best: dict[str, State] = {}
-    for s in search(obs, rng, progress=lambda x: tell(0.9 * x)):
+    for s in ranked:
         best.setdefault(s.kind, s)
     if not best:
         return _Consensus(refusal="no tracks move together for long enough to draw a joint", scattered=True)
@@ -179,8 +182,11 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
         follows = share > 0.5
         link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
                             every.frames)  # fmt: skip
-        starts = {k: (_redepth(b, link), link) for k, b in best.items()}
-        starts[kind] = (replace(s, depth=s.depth[follows]), link)
+        starts = {k: [(_redepth(b, link), link)] for k, b in best.items()}
+        starts[kind] = [(replace(s, depth=s.depth[follows]), link)]
+        # Hinges that lean to either side of the viewing ray may explain nearly the same: the last digits tell.
+        near = [h for h in ranked if h.kind == "revolute" and explained(h, obs)[0] > RIVAL * worth["revolute"]]
+        starts["revolute"] += [(_redepth(h, link), link) for h in distinct(near, RIVALS)[1:]]
         found = _Consensus(starts, moving[ids[follows]], total, _why_refused(s, every, follows) or "",
                            bool(follows.sum() < MIN_INLIERS))  # fmt: skip
         if not found.refusal:
@@ -227,7 +233,7 @@ def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, 
     starts = joints_between(static, link)
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])
-    done = finish(starts, uv, np.flatnonzero(link.members), view, still)
+    done = finish({k: [b] for k, b in starts.items()}, uv, np.flatnonzero(link.members), view, still)
     if reason := _why_not_believed(done):
         return JointFit("refused", reason, tracks=tracks, inliers=len(done.members))
     note = "; the camera moves: its path is fitted together with the joint"

@@ -418,10 +418,10 @@ def _best_of(hyps: list[Hypothesis], obs: Observations, coarse: int, fine: int, 
         pool = sorted((h for h in hyps if h.kind == kind), key=lambda h: -h.score)[:coarse]
         states = [extend(h, obs) for h in pool]
         states.sort(key=lambda s: -explained(s, obs, 2 * SCORE_PX)[0])
-        fined = [_refined(s, obs) for s in _distinct(states, fine)]
+        fined = [_refined(s, obs) for s in distinct(states, fine)]
         fined += more if kind == "revolute" else []
         fined.sort(key=lambda s: -explained(s, obs)[0])
-        last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in _distinct(fined, max(2, fine // 3))]
+        last = [refine(s, obs, scales=(4.0, 2.0), iterations=20) for s in distinct(fined, max(2, fine // 3))]
         if kind == "revolute":
             last += [
                 refine(_tilted_back(s, obs), obs, scales=(4.0, 2.0), iterations=20)
@@ -478,7 +478,8 @@ def _tilted_back(s: State, obs: Observations) -> State:
     return solve_depths(replace(s, axis=axis, point=point / size), obs)
 
 
-def _distinct(states: list[State], count: int) -> list[State]:
+def distinct(states: list[State], count: int) -> list[State]:
+    """The first `count` of different axis lines."""
     out: list[State] = []
     for s in states:
         if not any(_same(s, o) for o in out):

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint.bundle import State, refine, solve_depths
+from reconstruct.joint.finish import View, finish
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.models import joint_transform
+from reconstruct.joint.select import _tilted_back, key_frames, observations
 from tests.reconstruct.joint_scenes import H, W, make_scene, make_video, project
 
 SLAB = [[-0.3, 0.3], [-0.4, 0.0], [-0.02, 0.02]]
@@ -57,6 +60,27 @@ def test_joint_is_found_among_impostors(name):
     assert (fit.point_track < 90).mean() > 0.9
     assert fit.inliers > 45
     assert fit.std["axis_deg"] > 0 and np.isfinite(fit.std["q"]).all()
+
+
+def test_of_several_hinges_the_one_that_fits_is_taken():
+    """Hinges that lean to either side of the viewing ray both lie at the bottom of a valley."""
+    scene = make_scene(kind="revolute", axis=[0.82, -0.36, 0.45], point=[-0.09, 0.08, 1.34], q_end=0.75, impostors=0,
+                       size=[[-0.25, 0.25], [-0.3, 0], [-0.02, 0.02]], noise=0.15)  # fmt: skip
+    uv = np.asarray(scene.tracks.uv, float)[:90] - [(W - 1) / 2, (H - 1) / 2]
+    frames = key_frames(uv)
+    obs, ids = observations(uv, 768.0, np.zeros(2), frames, 90, np.random.default_rng(0), float(np.hypot(W, H)))
+    foot = scene.point - scene.axis * (scene.axis @ scene.point)
+    start = State("revolute", scene.axis, foot / np.linalg.norm(foot), scene.q[frames] - scene.q[frames[0]],
+                  np.ones(len(obs.ref)))  # fmt: skip
+    right = refine(solve_depths(start, obs), obs, scales=(4.0, 2.0), iterations=10)
+    twin = refine(_tilted_back(right, obs), obs, scales=(4.0, 2.0), iterations=20)
+
+    def error_deg(*starts):
+        done = finish({"revolute": [(s, obs) for s in starts]}, uv, ids, View(768.0))
+        return np.degrees(np.arccos(min(1.0, abs(done.bundle.twist.axis @ scene.axis))))
+
+    assert error_deg(twin) > 10
+    assert error_deg(twin, right) < 0.5
 
 
 def test_image_line_lies_on_the_projected_axis():
