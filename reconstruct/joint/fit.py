@@ -185,8 +185,9 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
         starts = {k: [(_redepth(b, link), link)] for k, b in best.items()}
         starts[kind] = [(replace(s, depth=s.depth[follows]), link)]
         # Hinges that lean to either side of the viewing ray may explain nearly the same: the last digits tell.
-        near = [h for h in ranked if h.kind == "revolute" and explained(h, obs)[0] > RIVAL * worth["revolute"]]
-        starts["revolute"] += [(_redepth(h, link), link) for h in distinct(near, RIVALS)[1:]]
+        if "revolute" in best:
+            near = [h for h in ranked if h.kind == "revolute" and explained(h, obs)[0] > RIVAL * worth["revolute"]]
+            starts["revolute"] += [(_redepth(h, link), link) for h in distinct(near, RIVALS)[1:]]
         found = _Consensus(starts, moving[ids[follows]], total, _why_refused(s, every, follows) or "",
                            bool(follows.sum() < MIN_INLIERS))  # fmt: skip
         if not found.refusal:
