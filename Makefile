@@ -36,9 +36,10 @@ demo: install
 	cp $(DEMO)/assets/demo/report.html $(DEMO)/report.html
 	@echo "open $(DEMO)/report.html (the report) and $(DEMO)/replay.mp4 (video and replay side by side)"
 
-# Two processes of one thread each: the suite is made of many short simulations and fits.
+# Two processes of one thread each: the suite is made of many short simulations and fits. Whole clips take minutes each,
+# so a process that is done takes work from the other.
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 # The assets that ship, from clips that are rendered here; under an hour on two cores.
 assets: install
