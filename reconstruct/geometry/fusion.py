@@ -75,7 +75,7 @@ class Fused:
     """Result of :func:`fuse_meshes`.
 
     Attributes:
-        static, moving: closed meshes, world at q = 0, with collision parts.
+        static, moving: closed meshes, world at q = 0; collision parts come when they are read as a cue.
         similarity: (K, 4, 4) that took each key mesh from its camera to the world.
         labels: per key mesh, (n,) bool of its samples: moving.
         residual_m: median distance of each registered mesh's static part from the others'.
@@ -394,7 +394,7 @@ def fuse_meshes(keys: Sequence[KeyMesh], fit: JointFit, masks: LinkMasks, size: 
 
 
 def _fuse_link(observations: list[tuple[Cloud, np.ndarray]]) -> LinkMesh:
-    """Average of signed distances on a grid, and its zero level.
+    """Average of signed distances on a grid, and its zero level; without collision parts.
 
     Args:
         observations: whole cloud and which of its samples are this link's, all in one frame.
@@ -429,9 +429,4 @@ def _fuse_link(observations: list[tuple[Cloud, np.ndarray]]) -> LinkMesh:
     rgba = np.full((len(vertices), 4), 255, np.uint8)
     rgba[:, :3] = np.clip(np.median(colours[near], axis=1), 0, 255)
     far = tree.query(vertices[faces].mean(1))[0] > 2 * cell
-    from reconstruct.geometry.given import bounded_solid
-    from reconstruct.geometry.solids import from_arrays, to_arrays
-
-    # Contact needs no more than a cell's precision, and the decomposition's time grows with the faces.
-    plain = to_arrays(from_arrays(vertices, faces).simplify(1.2 * cell))
-    return LinkMesh(vertices, faces, rgba, far, bounded_solid(*plain).parts)
+    return LinkMesh(vertices, faces, rgba, far, ())

@@ -83,17 +83,7 @@ def distance(vertices: np.ndarray, mesh) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("labels", ["votes", "segvigen"])
-def test_meshes_come_to_lie_on_the_object_at_rest(request_for, truth, labels, monkeypatch):
-    import trimesh
-
-    from reconstruct.geometry.given import GivenSolid
-
-    def one_hull(vertices, faces, seconds=0.0):  # cutting into convex parts takes a minute and is not what is looked at
-        hull = trimesh.Trimesh(vertices, faces).convex_hull
-        part = np.asarray(hull.vertices), np.asarray(hull.faces)
-        return GivenSolid(vertices, faces, (part,), 1, False)
-
-    monkeypatch.setattr("reconstruct.geometry.given.bounded_solid", one_hull)
+def test_meshes_come_to_lie_on_the_object_at_rest(request_for, truth, labels):
     request, _, _ = request_for(labels)
     provide("mesh", cues_io.MESHES[1], request)
     links = link_meshes(truth)
