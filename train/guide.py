@@ -27,22 +27,29 @@ from train.vec import Normal
 class Way(NamedTuple):
     """How a guide drives.
 
-    first, last: m by which it presses along the link's motion when that begins and when it ends.  pace: of the
-    reference's clock in between, an action.  chase: on top, how much faster by a stroke that the link is ahead.
+    first, last: m by which it presses along the link's motion when that begins, and later. Less than nothing: it holds
+    back by so much, from :data:`LEAD` before.  full: share of the stroke at which it presses by ``last``.  pace: of
+    the reference's clock while it drives, an action.  follow: whether it goes after a link that runs ahead of the
+    reference.
     """
 
     first: float
     last: float
+    full: float = 1.0
     pace: float = 0.0
-    chase: float = 0.0
+    follow: bool = False
 
 
-WAYS = (Way(0.01, 0.03), Way(0.01, 0.03, pace=-0.2), Way(0.0, 0.04, pace=-0.25), Way(0.0, 0.03, chase=2.0))
-TRIALS = 16  # draws in which each way is tried
+# A link that the arriving hand flings coasts ahead of it, which is no success: a hand that comes late and slowly flings
+# less, one that goes after the link goes on driving it. What is best depends on the joint.
+WAYS = (Way(-0.04, 0.03, 0.5, -0.3, True), Way(-0.04, 0.06, 0.7, -0.5), Way(-0.02, 0.04, 0.5, -0.3, True),
+        Way(0.01, 0.03))  # fmt: skip
+LEAD = 0.6  # s
+TRIALS = 32  # draws in which each way is tried
 STARTED = 0.005  # of the stroke: from here on the demonstrated hand drives
 SEED = 250_000  # of the guide's first episode: not the training's, nor those of evaluations
 ROUNDS = 3  # of as many episodes of the policy's own, which the guide comments
-EPOCHS, BATCH, RATE = 300, 256, 1e-3  # of imitation, each round
+EPOCHS, BATCH, RATE = 200, 256, 1e-3  # of imitation, each round; the rate falls to nothing in it
 
 
 def carried(asset: Asset, joint: tuple[np.ndarray, ...], q: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -71,25 +78,28 @@ class Guide:
                            zip(("axis", "point"), self.nominal, strict=True))  # fmt: skip
         self.offset = np.array(drawn.get("hand", np.zeros((n, 3))))
         self.sign = np.sign(demo["q_demo_end"] - demo["q_start"])
-        self.first, self.last, self.pace, self.chase = np.array(ways, float).T
+        self.first, self.last, self.full, self.pace, self.follow = np.array(ways, float).T
+        reference = self.asset.reference
+        drives = self.asset.stroke_fraction(reference.q) > STARTED
+        self.begin = reference.time[np.argmax(drives)] - np.where(self.first < 0, LEAD, 0.0)
 
     def act(self) -> np.ndarray:
         """(n, A) float32 residual actions for the next decision."""
         task, asset, reference = self.task, self.asset, self.asset.reference
         q = np.interp(task.time, reference.time, reference.q)
         stroke = asset.stroke_fraction(q)
-        started = stroke > STARTED
         palm = task.path(task.time).mean(1)
         home = carried(asset, self.nominal, -q, palm)
+        ahead = np.maximum((task.q - q) * self.sign, 0) * (stroke > STARTED)
+        q = q + self.follow * ahead * self.sign
         there = carried(asset, self.drawn, q, home)
         onward = carried(asset, self.drawn, q + 1e-3 * self.sign, home) - there
         onward /= np.maximum(np.linalg.norm(onward, axis=1, keepdims=True), 1e-12)
-        press = self.first + (self.last - self.first) * np.clip(stroke, 0, 1)
-        shift = there - palm - self.offset + (press * started)[:, None] * onward
+        press = self.first + (self.last - self.first) * np.clip(stroke / self.full, 0, 1)
+        shift = there - palm - self.offset + (press * (task.time >= self.begin))[:, None] * onward
         out = np.zeros((len(q), task.action_size), np.float32)
         out[:, :3] = np.clip(shift / task.translation, -1, 1)
-        ahead = np.maximum(asset.stroke_fraction(task.q) - stroke, 0.0)
-        out[:, 7] = np.clip(self.pace + self.chase * ahead, -1, 1) * started
+        out[:, 7] = self.pace * (stroke > STARTED)
         return out
 
 
@@ -183,12 +193,14 @@ def _fit(model: PPO, x: np.ndarray, y: np.ndarray, generator: torch.Generator, a
     parts = (policy.mlp_extractor.policy_net if actor else policy.mlp_extractor.value_net, head)
     optimiser = torch.optim.Adam([p for part in parts for p in part.parameters()], RATE)
     inputs, targets = torch.as_tensor(x), torch.as_tensor(y, dtype=torch.float32)
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, EPOCHS * -(-len(inputs) // BATCH))
     for _ in range(EPOCHS):
         for rows in torch.randperm(len(inputs), generator=generator).split(BATCH):
             loss = torch.nn.functional.mse_loss(head(latent(inputs[rows])), targets[rows])
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
+            falling.step()
     policy.set_training_mode(False)
 
 
