@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from taa_envs.asset import Asset
 from taa_envs.env import ArticulationEnv
 from taa_envs.files import written_whole
-from taa_envs.registry import max_episode_steps
-from train.evaluate import act, check, episodes
+from taa_envs.registry import CONTROL_PERIOD, max_episode_steps
+from train.evaluate import act, check
 from train.policy import Policy, load_policy
 
 
@@ -64,25 +64,36 @@ def record(asset: Asset, policy_file: str | os.PathLike, file: Path, *, seed: in
             writer.close()
 
 
-def strip(asset: Asset, policy_file: str | os.PathLike, file: Path, *, seed: int = 1_000_000, tries: int = 20,
-          columns: int = 5, height: int = 200) -> int | None:
-    """Write a PNG of the first episode in which the policy (above) succeeds and the replay (below) does not.
+def wall(shown: Sequence[tuple[Asset, Path]], file: Path, *, seed: int = 1_000_000, columns: int = 3, height: int = 120,
+         every: int = 4) -> None:
+    """Write an animated WebP: one drawn episode of every asset, the policy (left) beside the open-loop replay (right).
 
-    Returns:
-        the episode's seed; None where there is no such episode among the tries, and nothing is written.
+    Args:
+        shown: assets and their policies.
+        seed: of the episode, the same for all: none is picked.
+        every: environment steps of 0.02 s a picture.
     """
-    from PIL import Image
+    from PIL import Image, ImageDraw
 
-    policy, described = load_policy(policy_file)
-    check(asset, policy, described)
-    won, lost = (episodes(asset, acting, tries, seed=seed, action=described["action"])["success"]
-                 for acting in (policy, None))
-    wanted = np.flatnonzero(won & ~lost)
-    if not len(wanted):
-        return None
-    episode = seed + int(wanted[0])
-    frames = [list(pictures) for pictures in _pairs(asset, policy, described["action"], episode, height, every=5)]
-    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns).round().astype(int)]
+    films = []
+    for asset, policy_file in shown:
+        policy, described = load_policy(policy_file)
+        check(asset, policy, described)
+        frames = []
+        for pictures in _pairs(asset, policy, described["action"], seed, height, every):
+            image = Image.fromarray(np.hstack(pictures))
+            ImageDraw.Draw(image).text((4, 2), asset.id, fill="white", stroke_width=1, stroke_fill="black")
+            frames.append(np.array(image))
+        films.append(frames)
+    longest = max(map(len, films))
+    width = max(film[0].shape[1] for film in films)
+    walls = []
+    for k in range(longest + 5):  # the end stays for a moment
+        canvas = np.zeros((-(-len(films) // columns) * height, columns * width, 3), np.uint8)
+        for i, film in enumerate(films):
+            tile, at = film[min(k, len(film) - 1)], divmod(i, columns)
+            canvas[at[0] * height:][: tile.shape[0], at[1] * width:][:, : tile.shape[1]] = tile
+        walls.append(Image.fromarray(canvas))
     with written_whole(Path(file)) as partial:
-        Image.fromarray(np.vstack([np.hstack([f[who] for f in chosen]) for who in (0, 1)])).save(partial, optimize=True)
-    return episode
+        walls[0].save(partial, format="webp", save_all=True, append_images=walls[1:],
+                      duration=round(1000 * every * CONTROL_PERIOD), loop=0, quality=55, method=6)

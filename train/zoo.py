@@ -29,8 +29,15 @@ from taa_envs.files import written_whole
 from taa_envs.registry import find_assets, get_asset, shipped_folder
 from train.config import load_config
 from train.evaluate import evaluate
-from train.film import strip
+from train.film import wall
 from train.run import train
+
+GOAL = 0.95
+"""Success that a policy is to reach."""
+POOR = 0.75
+"""A replay that succeeds less often than this is one on which a policy is to improve."""
+FILMED = 1_000_000
+"""Seed of the episode that the page shows: the first of :func:`train.evaluate.evaluate`."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +95,23 @@ def table(entries: Sequence[Entry]) -> str:
     return "\n".join(rows)
 
 
-def page(entries: Sequence[Entry], command: str, figure: str | None, film: tuple[str, str, int] | None = None) -> str:
-    """Markdown page around the table. film: a strip's picture, the asset in it and the episode's seed."""
+def summary(entries: Sequence[Entry]) -> str:
+    """What the table says, in a sentence or two."""
+    rates = {e.asset.id: e.pooled("policy")[0] for e in entries}
+    short = {i: rate for i, rate in sorted(rates.items(), key=lambda item: item[1]) if rate < GOAL}
+    gains = [100 * (rates[e.asset.id] - e.pooled("replay")[0]) for e in entries if e.pooled("replay")[0] < POOR]
+    text = f"{len(rates) - len(short)} of {len(rates)} assets reach {GOAL:.0%}"
+    text += "; " + ", ".join(f"{i} {rate:.0%}" for i, rate in short.items()) + "." if short else "."
+    if gains:
+        text += (f" Where the replay succeeds in less than {POOR:.0%} ({len(gains)} of them) the policy is "
+                 f"{min(gains):.0f} to {max(gains):.0f} points above it.")
+    return text
+
+
+def page(entries: Sequence[Entry], command: str, figure: str | None, film: str | None = None) -> str:
+    """Markdown page around the table. figure, film: pictures of the curves and of :func:`train.film.wall`."""
     run = entries[0].runs[0]
-    lines = ["# Policy zoo", "",
+    lines = ["# Policy zoo", "", f"**{summary(entries)}**", "",
              f"`{command}` trains and evaluates all of it (settings: `train/configs`). Success in {run['episodes']} "
              "episodes a seed under each asset's own randomisation, none of them seen in training, with 95 % Wilson "
              "intervals; the replay runs in the same episodes. The intervals count episodes as if seeds were alike; "
@@ -104,9 +124,9 @@ def page(entries: Sequence[Entry], command: str, figure: str | None, film: tuple
                   "one ends the training. Lines: with the noise that training explores with, over 100 episodes (each "
                   "counted once all that began with it have ended). Dashed: the replay in the table's episodes.*", ""]
     if film is not None:
-        lines += [f"![Two rows of five moments of one episode.]({film[0]})", "",
-                  f"*`{film[1]}`, one drawn episode (seed {film[2]}): the policy above, the open-loop replay below, "
-                  f"which fails in it. `taa evaluate {film[1]} POLICY --video FILE` films more.*", ""]
+        lines += [f"![Every asset: a policy and the replay in one episode.]({film})", "",
+                  f"*The first seed's policy (left) beside the open-loop replay (right), in the table's first episode, "
+                  f"whatever came of it (seed {FILMED}). `taa evaluate ID POLICY --video FILE` films more.*", ""]
     return "\n".join(lines)
 
 
@@ -170,16 +190,13 @@ def main(argv: Sequence[str] | None = None) -> None:
                 write_page(arguments.page, [e for e in entries if e.runs], command)
     print(table(entries))
     if arguments.page is not None:
-        most = max(entries, key=lambda e: e.pooled("policy")[0] - e.pooled("replay")[0])
-        picture = arguments.page.parent / "images" / "zoo_policy.png"
-        gain = most.pooled("policy")[0] - most.pooled("replay")[0]
-        run = arguments.out / f"{most.asset.id}-{arguments.algo}-{arguments.seeds[0]}"
-        shown = strip(most.asset, run, picture) if gain >= 0.1 else None
-        if shown is not None:
-            write_page(arguments.page, entries, command, ("images/zoo_policy.png", most.asset.id, shown))
+        film = arguments.page.parent / "images" / "zoo.webp"
+        runs = [arguments.out / f"{e.asset.id}-{arguments.algo}-{arguments.seeds[0]}" for e in entries]
+        wall([(e.asset, run) for e, run in zip(entries, runs, strict=True)], film, seed=FILMED)
+        write_page(arguments.page, entries, command, "images/zoo.webp")
 
 
-def write_page(file: Path, entries: Sequence[Entry], command: str, film: tuple[str, str, int] | None = None) -> None:
+def write_page(file: Path, entries: Sequence[Entry], command: str, film: str | None = None) -> None:
     """The page and its figure, ``images/zoo.png`` beside it."""
     figure = file.parent / "images" / "zoo.png"
     figure.parent.mkdir(parents=True, exist_ok=True)

@@ -74,6 +74,15 @@ def _outside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     return np.array([max(0.0, -cv2.pointPolygonTest(hull, (float(u), float(v)), True)) for u, v in points])
 
 
+def _affine(before: np.ndarray, after: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (n, 2) moved by the affine map that takes before (M, 2) to after (M, 2) best."""
+    middle, size = before.mean(0), max(float(before.std()), 1e-9)
+    A = np.column_stack([(before - middle) / size, np.ones(len(before))])
+    # Seen edge-on the part says nothing about what is beside its line: no slope there.
+    X = np.linalg.lstsq(A, after - before, rcond=0.1)[0]
+    return points + np.column_stack([(points - middle) / size, np.ones(len(points))]) @ X
+
+
 def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndarray, moving: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of one hand: apart (T,) from the part in palm sizes (NaN unseen); moves with it (T,) and otherwise (T,).
@@ -103,8 +112,13 @@ def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndar
             if tell.sum() < 3:  # too little motion to tell a moving hand from a resting one: look longer
                 continue
             own = hand.uv[b, CONTACT] - hand.uv[a, CONTACT]
+            # Fingers beyond the part's edge move on with it as its picture would if it went on there.
+            onward = _affine(picture[a], picture[b], hand.uv[a, CONTACT]) - hand.uv[a, CONTACT]
+            reach = np.maximum(np.linalg.norm(onward, axis=1), stride)
+            agrees = np.minimum(np.linalg.norm(own - part, axis=1) / np.maximum(stride, 1e-9),
+                                np.linalg.norm(own - onward, axis=1) / np.maximum(reach, 1e-9)) < AGREE  # fmt: skip
+            agree[t] = np.mean(agrees[tell]) >= 0.3
             unit, own = part[tell] / stride[tell, None], own[tell] / stride[tell, None]
-            agree[t] = np.mean(np.linalg.norm(own - unit, axis=1) < AGREE) >= 0.3
             # Faster or slower along the part's way is doubt; standing still or going elsewhere is contradiction.
             along = (own * unit).sum(1)
             aside = np.linalg.norm(own - along[:, None] * unit, axis=1)

@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -248,16 +249,20 @@ def test_exploration_falls_along_its_line(door: Asset, tmp_path: Path) -> None:
     assert (load_policy(tmp_path / "run")[0].network.log_std < -1.9).all()
 
 
-def test_a_strip_shows_where_the_policy_wins(door: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wall_shows_every_asset_to_its_end(door: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from train import film
 
     train(door, Config(**{**PPO.as_dict(), "steps": 256}), tmp_path / "run")
-    picture = np.zeros((20, 30, 3), np.uint8)
-    monkeypatch.setattr(film, "_pairs", lambda *_, **__: iter([[picture, picture]] * 8))
-    wins = {True: [True, False, True, True], False: [True, False, False, False]}  # of the policy, of the replay
-    monkeypatch.setattr(film, "episodes", lambda asset, policy, count, **_: {
-        "success": np.array(wins[policy is not None][:count])})
-    assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=2) is None
-    assert not (tmp_path / "a.png").exists()
-    assert film.strip(door, tmp_path / "run", tmp_path / "a.png", seed=7, tries=4) == 9
-    assert Image.open(tmp_path / "a.png").size == (5 * 30, 2 * 20)
+    lengths = iter([8, 3])
+
+    def pairs(*_: object, **__: object) -> Iterator[list[np.ndarray]]:
+        for k in range(next(lengths)):
+            yield [np.full((20, 30, 3), 20 * k, np.uint8)] * 2
+
+    monkeypatch.setattr(film, "_pairs", pairs)
+    film.wall([(door, tmp_path / "run")] * 2, tmp_path / "a.webp", columns=1, height=20)
+    image = Image.open(tmp_path / "a.webp")
+    assert image.size == (60, 40) and image.format == "WEBP"
+    image.seek(7)
+    last = np.array(image.convert("RGB"))[::20, -1, 0].astype(int)
+    assert np.abs(last - [140, 40]).max() < 12  # the shorter one waits at its end

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,12 @@ def test_seeds_are_pooled_and_shown(door: Asset) -> None:
     assert "**94%**" in row and "90%, 98%" in row and "+44" in row and "50% (40% to 60%)" in row
 
 
+def test_the_summary_counts_every_asset_and_names_those_that_fall_short(door: Asset) -> None:
+    other = replace(door, id="lid")
+    said = zoo.summary([zoo.Entry(door, [run_of(0.94, 0.5)], []), zoo.Entry(other, [run_of(0.95, 0.8)], [])])
+    assert said.startswith(f"1 of 2 assets reach 95%; {door.id} 94%.") and "(1 of them) the policy is 44 to 44" in said
+
+
 @pytest.mark.slow
 def test_what_is_done_is_not_done_again(door: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TAA_ASSETS", str(door.path.parent))
@@ -32,6 +39,7 @@ def test_what_is_done_is_not_done_again(door: Asset, tmp_path: Path, monkeypatch
                str(tmp_path / "zoo"), "--page", str(page)]
     zoo.main(command)
     text = page.read_text()
+    assert (page.parent / "images" / "zoo.webp").stat().st_size > 2000
     assert "| door | revolute |" in text and (page.parent / "images" / "zoo.png").stat().st_size > 5000
 
     def never(*_: object, **__: object) -> dict:
