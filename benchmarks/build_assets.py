@@ -98,11 +98,18 @@ def table(rows: list[dict]) -> str:
 
 
 def write_readme(folder: Path, text: str) -> None:
-    """The table into ``README.md`` between its two marks."""
+    """The table into ``README.md`` between its two marks; rows of clips that are not in it stay as they were."""
     file = folder / "README.md"
-    old = file.read_text(encoding="utf-8")
-    head, rest = old.split(BEGIN)
-    file.write_text(f"{head}{BEGIN}\n\n{text}\n\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    head, rest = file.read_text(encoding="utf-8").split(BEGIN)
+    old, tail = rest.split(END)
+
+    def clip(line: str) -> str:
+        return line.split("|")[1].strip().strip("`").removeprefix(PREFIX)
+
+    titles, new = text.splitlines()[:2], text.splitlines()[2:]
+    rows = {clip(line): line for line in [*old.strip().splitlines()[2:], *new]}
+    lines = [*titles, *(rows[name] for name in CLIPS if name in rows)]
+    file.write_text(f"{head}{BEGIN}\n\n" + "\n".join(lines) + f"\n\n{END}{tail}", encoding="utf-8")
 
 
 def main(argv: list[str] | None = None) -> int:

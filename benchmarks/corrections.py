@@ -33,8 +33,8 @@ def successes(asset: Asset, count: int, seed: int = 1_000_000) -> list[float]:
 
 
 def words(way: Way) -> str:
-    pace = f" at {1 + 1.5 * way.pace:.2g} of the pace" if way.pace else ", chasing" if way.chase else ""
-    return f"{100 * way.first:g} to {100 * way.last:g} cm{pace}"
+    pace = f" at {1 + 1.5 * way.pace:.2g} of the pace" if way.pace else ""
+    return f"{100 * way.first:g} to {100 * way.last:g} cm{pace}{', goes after the link' if way.follow else ''}"
 
 
 def main() -> None:

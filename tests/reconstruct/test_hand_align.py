@@ -4,9 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from reconstruct.cues import Hands, HandTrack
 from reconstruct.hand.align import align_hand
+from reconstruct.hand.drive import _affine as onward
 from reconstruct.hand.drive import close_gaps, find_drive, runs
 from reconstruct.hand.grip import penetration
 from reconstruct.hand.pnp import hand_positions
@@ -53,6 +56,17 @@ def test_a_monocular_hand_becomes_one_that_drives_the_part(name: str, seed: int,
     # No jumps: a person's hand stays below 3 m/s.
     speed = np.linalg.norm(np.diff(reference.hand_joints, axis=0), axis=-1).max() * 30
     assert speed < 3.0
+
+
+@given(st.integers(0, 1000), st.floats(-0.5, 0.5), st.floats(0.8, 1.2))
+def test_what_goes_on_beyond_the_edge_moves_on_as_the_part(seed: int, angle: float, zoom: float) -> None:
+    rng = np.random.default_rng(seed)
+    before, beyond = rng.uniform(0, 100, (40, 2)), rng.uniform(120, 160, (5, 2))
+    A = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    assert np.allclose(onward(before, before @ A.T + 7, beyond), beyond @ A.T + 7)
+    # Seen edge-on: along its line the motion goes on, beside it nothing is known and it moves as the line does there.
+    line = before * [1, 0]
+    assert np.allclose(onward(line, line + [0, 5], beyond), beyond + [0, 5])
 
 
 def test_a_still_part_has_no_driving_hand() -> None:
