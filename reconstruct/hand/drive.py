@@ -83,11 +83,12 @@ def _affine(before: np.ndarray, after: np.ndarray, points: np.ndarray) -> np.nda
     return points + np.column_stack([(points - middle) / size, np.ones(len(points))]) @ X
 
 
-def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndarray, moving: np.ndarray
+def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndarray, moving: np.ndarray, beyond: bool
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of one hand: apart (T,) from the part in palm sizes (NaN unseen); moves with it (T,) and otherwise (T,).
 
     Neither of the last two holds where the part moves too little to tell. surface (M, 3): points of the link at q = 0.
+    beyond: fingers may also move as the part's picture would if it went on to where they are.
     """
     n = len(time)
     away, agree, differ = np.full(n, np.nan), np.zeros(n, bool), np.zeros(n, bool)
@@ -112,11 +113,11 @@ def _evidence(hand: HandTrack, fit: JointFit, time: np.ndarray, surface: np.ndar
             if tell.sum() < 3:  # too little motion to tell a moving hand from a resting one: look longer
                 continue
             own = hand.uv[b, CONTACT] - hand.uv[a, CONTACT]
-            # Fingers beyond the part's edge move on with it as its picture would if it went on there.
-            onward = _affine(picture[a], picture[b], hand.uv[a, CONTACT]) - hand.uv[a, CONTACT]
-            reach = np.maximum(np.linalg.norm(onward, axis=1), stride)
-            agrees = np.minimum(np.linalg.norm(own - part, axis=1) / np.maximum(stride, 1e-9),
-                                np.linalg.norm(own - onward, axis=1) / np.maximum(reach, 1e-9)) < AGREE  # fmt: skip
+            agrees = np.linalg.norm(own - part, axis=1) < AGREE * stride
+            if beyond:
+                onward = _affine(picture[a], picture[b], hand.uv[a, CONTACT]) - hand.uv[a, CONTACT]
+                reach = np.maximum(np.linalg.norm(onward, axis=1), stride)
+                agrees |= np.linalg.norm(own - onward, axis=1) < AGREE * reach
             agree[t] = np.mean(agrees[tell]) >= 0.3
             unit, own = part[tell] / stride[tell, None], own[tell] / stride[tell, None]
             # Faster or slower along the part's way is doubt; standing still or going elsewhere is contradiction.
@@ -184,17 +185,22 @@ def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarra
     rate = 1.0 / max(float(np.median(np.diff(time))), 1e-6)
     # Evidence weighs as much as the joint moves meanwhile.
     motion = np.abs(np.gradient(fit.q))
-    best, best_motion = None, 0.0
-    for i, hand in enumerate(hands.tracks):
-        away, agree, differ = _evidence(hand, fit, time, surface, moving)
-        near = away < NEAR
-        half = max(2, round(0.15 * rate))
-        drives = _majority(agree, near & moving, half)
-        differ = _majority(differ, (away < BESIDE) & moving, half)
-        driven = float(motion[drives].sum())
-        if driven > best_motion:
-            best, best_motion = (i, near, drives, away < BESIDE, differ), driven
-    if best is None or best_motion < 0.05 * float(motion.sum()) or best[2].sum() < 3:
+    half = max(2, round(0.15 * rate))
+    # A hand on the part moves as the surface under it. Fingers beyond the part's edge move farther; what they would do
+    # there is a guess that other motions meet too, so it is asked only where no hand moves as the surface does.
+    for beyond in (False, True):
+        best, best_motion = None, 0.0
+        for i, hand in enumerate(hands.tracks):
+            away, agree, differ = _evidence(hand, fit, time, surface, moving, beyond)
+            near = away < NEAR
+            drives = _majority(agree, near & moving, half)
+            differ = _majority(differ, (away < BESIDE) & moving, half)
+            driven = float(motion[drives].sum())
+            if driven > best_motion:
+                best, best_motion = (i, near, drives, away < BESIDE, differ), driven
+        if best is not None and best_motion >= 0.05 * float(motion.sum()) and best[2].sum() >= 3:
+            break
+    else:
         return Drive(None, nobody, nobody, nobody)
     index, near, drives, beside, differ = best
     valid = hands.tracks[index].valid
