@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from taa_envs.asset import Asset
 
 
+ARM_SHARE = 0.2
+"""Where no joint is found and this share of what moves stays on a forearm, it is sought without the arms' tracks."""
+
+
 class Progress(Protocol):
     """What is told about a run, one stage after another."""
 
@@ -294,18 +298,22 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
 
 def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float | None, seed: int,
                       progress: Callable[[float], None]) -> JointFit:  # fmt: skip
-    """The joint without depth; where a forearm is what was found, that without the forearms' tracks."""
+    """The joint without depth; where a forearm is what was found, or may hide it, that without the arms' tracks."""
     from reconstruct.hand.forearm import on_forearm
-    from reconstruct.joint.fit import fit_joint
+    from reconstruct.joint.fit import fit_joint, moving_tracks
 
     fit = fit_joint(video, tracks, focal, seed, progress, camera_moving=False)
-    if fit.verdict == "refused":
-        return fit
     arm = on_forearm(tracks, hands)
-    if np.mean(arm[fit.point_track]) < 0.5:
+    if fit.verdict == "refused":
+        moving = moving_tracks(video, tracks)
+        if not len(moving) or np.mean(arm[moving]) < ARM_SHARE:
+            return fit
+    elif np.mean(arm[fit.point_track]) < 0.5:
         return fit
     rest = replace(tracks, visible=tracks.visible & ~arm[:, None])
     again = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
+    if fit.verdict == "refused" and again.verdict == "refused":
+        return fit
     # No semicolon: what follows one is advice.
     return replace(again, reason=f"without the arm that moved most, {again.reason}")
 

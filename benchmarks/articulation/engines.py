@@ -44,7 +44,8 @@ class Answer:
 
 
 def solve(given: Given, best: Bound | None, focal_known: bool = True, seed: int = 0) -> Answer:
-    """Run the estimator that fits the row: with 3D tracks in rows 1 and 2, without depth in row 3."""
+    """Run the estimator that fits the row: with 3D tracks in rows 1 and 2, without depth in row 3; in row 4 as the
+    pipeline does, which knows where the arms are."""
     begin = time.perf_counter()
     try:
         fit = _with_depth(given, seed) if given.depth is not None else _without_depth(given, focal_known, seed)
@@ -87,12 +88,16 @@ def _with_depth(given: Given, seed: int) -> JointFit:
 
 def _without_depth(given: Given, focal_known: bool, seed: int) -> JointFit:
     from reconstruct.joint.fit import fit_joint
+    from reconstruct.pipeline import joint_off_the_arm
 
     T = given.uv.shape[1]
     blank = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
     video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, blank, 1.0)
     tracks = Tracks(given.uv.astype(np.float32), given.visible, given.scene.seed, PROVIDER)
-    return fit_joint(video, tracks, float(given.scene.shot.K[0, 0]) if focal_known else None, seed)
+    focal = float(given.scene.shot.K[0, 0]) if focal_known else None
+    if given.hands is not None:
+        return joint_off_the_arm(video, tracks, given.hands, focal, seed, lambda _: None)
+    return fit_joint(video, tracks, focal, seed)
 
 
 def _registration(fit: JointFit, given: Given, best: Bound | None) -> tuple[float, np.ndarray] | None:

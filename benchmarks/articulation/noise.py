@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.articulation.motions import SIZE
 from benchmarks.articulation.scenes import Scene, rng_of
+from reconstruct.cues import Hands
 
 ROWS = (1, 2, 3)
 OUTLIERS = 0.20
@@ -28,6 +29,7 @@ class Given:
         link: (N,) bool, said by the masks to lie on the moving link; None in row 3.
         wrong: (N, T) bool, truth: not an observation of its point.
         sigma_px, sigma_depth (of the logarithm), sigma_field: standard deviations of the noise; zeros in row 1.
+        hands: detected ones, row 4 only.
     """
 
     scene: Scene
@@ -40,6 +42,7 @@ class Given:
     sigma_px: float
     sigma_depth: float
     sigma_field: float
+    hands: Hands | None = None
 
 
 def field_basis(uv: np.ndarray) -> np.ndarray:

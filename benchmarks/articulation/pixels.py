@@ -7,6 +7,7 @@ surface under the pixel in which it was seeded.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -46,7 +47,8 @@ def film(model: Model, motion: str, texture: str, small: bool = False, seed: int
     tracks = track_points(video, hands)
     if not len(tracks.uv):
         raise Hidden(f"{model.name}: nothing was tracked")
-    return _known(model, motion, small, shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+    known = _known(model, motion, small, shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+    return replace(known, hands=hands)
 
 
 def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, visible: np.ndarray,

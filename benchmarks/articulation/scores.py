@@ -89,8 +89,10 @@ def _coverage(row: dict, answer: Answer, error: np.ndarray) -> dict:
     out: dict = {}
     std = answer.std
     if np.isfinite(std.get("axis_deg", np.nan)):
+        out["stated_axis_deg"] = std["axis_deg"]
         out["covered_axis"] = bool(row["axis_deg"] <= 1.96 * std["axis_deg"] + 1e-6)
     if row["centroid_mm"] is not None and np.isfinite(std.get("point_m", np.nan)):
+        out["stated_centroid_mm"] = 1e3 * std["point_m"]
         out["covered_location"] = bool(row["centroid_mm"] / 1e3 <= 1.96 * std["point_m"] + 1e-9)
     held = np.isfinite(std["q"]) & (std["q"] > 0)
     if held.any():

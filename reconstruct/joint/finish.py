@@ -32,8 +32,9 @@ from reconstruct.joint.uncertainty import (
 )
 
 MIN_COMMON = 8
-FLEX_PX = 1.0
-"""How far real parts flex and tracks drift together, working px, once errors are seen to be shared at all."""
+FLEX_PX, FLEX_SIGMAS = 1.0, 4.0
+"""How far real parts flex and tracks drift together without a residual that shows it, once errors are seen to be shared
+at all: so many working px, and no more than so many times the noise that is seen."""
 MOST_FRAMES, MOST_TRACKS = 220, 400
 """Bounds of one bundle adjustment; further frames get their state afterwards, further tracks their point."""
 FREE_FRAMES, MOST_STILL = 100, 200
@@ -263,7 +264,8 @@ def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sight
         sight = replace(sight, seen=sight.seen & ~lost, lasting=lasting)
     # Errors that neighbours share are no noise: they stay for as long as the tracks do. So does what the compensation
     # of a moving camera leaves, which the joint may take up until no residual shows it.
-    alike = (FLEX_PX**2 * rho + restless**2) * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2
+    flex = min(FLEX_PX, FLEX_SIGMAS * sigma)
+    alike = (flex**2 * rho + restless**2) * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2
     return replace(sight, weight=shared_weights(rho, cluster), lasting=max(sight.lasting, alike))
 
 

@@ -87,7 +87,7 @@ def fit_joint(
     found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
-        stretches = motion_stretches(uv[_moving(uv, camera)], video.time)
+        stretches = motion_stretches(uv[_moving(uv, camera.diagonal)], video.time)
         tries = [
             _consensus(_only(uv, span), camera, rng, lambda _: None) for span in stretches[:3] if len(stretches) > 1
         ]
@@ -135,18 +135,25 @@ class _Consensus:
     scattered: bool = False
 
 
-def _moving(uv: np.ndarray, camera: _Camera) -> np.ndarray:
+def _moving(uv: np.ndarray, diagonal: float) -> np.ndarray:
     """Indices of the tracks that leave their place."""
     extent = np.zeros(len(uv))
     some = np.isfinite(uv[..., 0]).sum(1) > 1
     if some.any():
         extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
-    return np.flatnonzero(extent > MOVING_SHARE * camera.diagonal)
+    return np.flatnonzero(extent > MOVING_SHARE * diagonal)
+
+
+def moving_tracks(video: Video, tracks: Tracks) -> np.ndarray:
+    """Indices of the tracks that leave their place."""
+    uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
+    h, w = video.frames.shape[1:3]
+    return _moving(uv, float(np.hypot(h, w)))
 
 
 def _restlessness(uv: np.ndarray, camera: _Camera, share: float) -> float:
     """Working px, RMS, by which a share of the tracks at rest leave their place at most; infinite if there are none."""
-    rest = np.setdiff1d(np.flatnonzero(np.isfinite(uv[..., 0]).mean(1) > 0.5), _moving(uv, camera))
+    rest = np.setdiff1d(np.flatnonzero(np.isfinite(uv[..., 0]).mean(1) > 0.5), _moving(uv, camera.diagonal))
     if not len(rest):
         return np.inf
     off = uv[rest] - np.nanmedian(uv[rest], axis=1)[:, None]
@@ -154,7 +161,7 @@ def _restlessness(uv: np.ndarray, camera: _Camera, share: float) -> float:
 
 
 def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:
-    moving = _moving(uv, camera)
+    moving = _moving(uv, camera.diagonal)
     if len(moving) < MIN_INLIERS:
         return _Consensus(refusal=f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place")
     keys = key_frames(uv[moving])

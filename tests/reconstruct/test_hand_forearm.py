@@ -5,6 +5,9 @@ import pytest
 
 from reconstruct.cues import Hands, HandTrack, ProviderInfo, Tracks
 from reconstruct.hand.forearm import on_forearm
+from reconstruct.joint.models import JointFit
+from reconstruct.pipeline import ARM_SHARE, joint_off_the_arm
+from tests.reconstruct.joint_scenes import make_video
 
 MADE = ProviderInfo("made", "0", "Apache-2.0")
 T = 40
@@ -40,3 +43,29 @@ def test_only_what_stays_beyond_the_wrist(turn):
     assert not found[30:60].any()
     assert found[60:].mean() < 0.1
     assert not on_forearm(tracks, Hands((), hands.mask, MADE)).any()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_where_an_arm_may_hide_the_joint_it_is_sought_without_it(share, monkeypatch):
+    """Which tracks the search is given, not the search: `benchmarks.articulation --rows 4` has rendered sleeves."""
+    hands, wrist, along = hand_path(0.3)
+    rng = np.random.default_rng(0)
+    sleeve = wrist + (rng.uniform(30, 250, (int(100 * share), 1)) * along)[:, None]
+    held = wrist - (rng.uniform(90, 250, (100 - len(sleeve), 1)) * along)[:, None]
+    uv = np.concatenate([sleeve, held]).astype(np.float32)
+    tracks = Tracks(uv, np.ones(uv.shape[:2], bool), np.zeros(100, int), MADE)
+    asked = []
+
+    def refusing_arms(video, tracks, focal, seed, progress, camera_moving):
+        asked.append(tracks.visible.any(1))
+        arms = asked[-1][: len(sleeve)].any()
+        return JointFit("refused", "a free body") if arms else JointFit("ok", "found", "revolute")
+
+    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", refusing_arms)
+    fit = joint_off_the_arm(make_video(T), tracks, hands, None, 0, lambda _: None)
+    if share < ARM_SHARE:
+        assert (fit.verdict, fit.reason, len(asked)) == ("refused", "a free body", 1)
+    else:
+        assert (fit.verdict, fit.reason) == ("ok", "without the arm that moved most, found")
+        assert len(asked) == 2 and asked[0].all()
+        assert np.array_equal(asked[1], np.arange(100) >= len(sleeve))
