@@ -39,7 +39,7 @@ demo: install
 # Two processes of one thread each: the suite is made of many short simulations and fits. Whole clips take minutes each,
 # so a process that is done takes work from the other.
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations 15
 
 # The assets that ship, from clips that are rendered here; under an hour on two cores.
 assets: install
