@@ -140,7 +140,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     guided = content is not None and content["guided"]
     # Where so few steps are asked for that the guide would take them all, there is none.
     to_guide = config.guide_episodes > 0 and most_steps(config, batch.max_episode_steps) <= config.steps
-    over = made >= config.steps or (bool(rows) and rows[-1][EVALUATED] >= config.enough)
+    over = made >= config.steps or (guided >= to_guide and bool(rows) and rows[-1][EVALUATED] >= config.enough)
     while not over:
         if len(rows) < (config.evaluate_every > 0):
             pass  # the untrained policy is evaluated first: PPO's is the replay
@@ -164,7 +164,8 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         model.logger.dump(made)
         if progress is not None:
             progress(min(made / config.steps, 1.0), dict(zip(COLUMNS, rows[-1], strict=True)))
-        over = (made >= config.steps or evaluated >= config.enough
+        # A replay that never failed in the evaluation may fail in others: the guide's lessons are not left out.
+        over = (made >= config.steps or (evaluated >= config.enough and guided >= to_guide)
                 or (minutes is not None and time.monotonic() - begin >= 60 * minutes))
         if made - saved >= config.checkpoint_every or over:
             save_torch(checkpoint, {**_checkpoint(model, env, normal, episodes, rows), "best": best, "guided": guided})

@@ -243,6 +243,17 @@ def test_a_replay_that_needs_no_training_is_left_as_it_is(door: Asset, tmp_path:
     assert not policy.act(np.random.default_rng(0).normal(size=(4, *policy.sizes[0]))).any()  # the replay
 
 
+def test_a_replay_that_never_failed_in_the_evaluation_is_taught_all_the_same(door: Asset, tmp_path: Path,
+                                                                             monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("TRIALS", 1), ("WAYS", (Way(0.0, 0.02),)), ("ROUNDS", 1), ("EPOCHS", 3)):
+        monkeypatch.setattr(f"train.guide.{name}", value)
+    config = Config(**{**GUIDED.as_dict(), "enough": 0.0, "evaluate_episodes": 2})
+    done = train(door, config, tmp_path / "run")
+    assert done["guided"] is True and 0 < done["steps"] < config.steps
+    assert train(door, config, tmp_path / "run")["resumed_at"] == done["steps"]  # it stays ended
+
+
+
 def test_exploration_falls_along_its_line(door: Asset, tmp_path: Path) -> None:
     config = Config(**{**PPO.as_dict(), "steps": 512, "anneal_to": -2.0, "anneal_steps": 256})
     train(door, config, tmp_path / "run")
