@@ -150,7 +150,7 @@ def draw(file: Path, entries: Sequence[Entry]) -> None:
             ax.plot(steps / 1000, evaluated, ".", markersize=5, color=f"C{k}")
         ax.axhline(entry.pooled("replay")[0], color="0.4", linestyle="--", linewidth=1)
         ax.set_title(entry.asset.id, fontsize=9)
-        ax.set_ylim(0, 1)
+        ax.set_ylim(0, 1.03)
         ax.set_xlabel("thousand steps", fontsize=8)
         ax.tick_params(labelsize=8)
     for ax in list(axes.flat)[len(entries):]:
