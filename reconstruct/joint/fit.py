@@ -136,7 +136,7 @@ class _Consensus:
 
 
 def _moving(uv: np.ndarray, diagonal: float) -> np.ndarray:
-    """Indices of the tracks that leave their place."""
+    """(k,) indices of the tracks (N, T, 2) that leave their place; working px."""
     extent = np.zeros(len(uv))
     some = np.isfinite(uv[..., 0]).sum(1) > 1
     if some.any():
@@ -145,7 +145,7 @@ def _moving(uv: np.ndarray, diagonal: float) -> np.ndarray:
 
 
 def moving_tracks(video: Video, tracks: Tracks) -> np.ndarray:
-    """Indices of the tracks that leave their place."""
+    """(k,) indices of the tracks whose extent exceeds :data:`MOVING_SHARE` of the image diagonal."""
     uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
     h, w = video.frames.shape[1:3]
     return _moving(uv, float(np.hypot(h, w)))
