@@ -186,7 +186,7 @@ def stabilise(video: Video, scratch: Path | None = None, seed: int = 0) -> tuple
     motion = replace(motion, H=H)
     out.flush()
     note = f"camera drifts by up to {motion.drift_px.max() / video.scale:.1f} px; compensated by homographies"
-    return replace(video.with_frames(out, note), stabilised=True), motion
+    return replace(video.with_frames(out, note), warp=H), motion
 
 
 def _warp(image: np.ndarray, H: np.ndarray) -> np.ndarray:

@@ -48,7 +48,8 @@ class Video:
         scale: working px per full px.
         focal_px: focal length from metadata, full px, or None.
         notes: what was odd about the file (corrupt frames, odd times), for the report.
-        stabilised: whether the frames are those of a moving camera, warped to its first view.
+        warp: (T, 3, 3) homographies, working px, that took the frames of a moving camera to its first view; None where
+            the camera rests.
     """
 
     path: Path
@@ -61,7 +62,7 @@ class Video:
     scale: float
     focal_px: float | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
-    stabilised: bool = False
+    warp: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)

@@ -66,7 +66,7 @@ MOST_POSES, MOST_POINTS = 30, 150
 def looser(b: Bundle, s: Sightings) -> float | None:
     """How many times better the joint's own points follow a body that moves freely: the ratio of the two fits' noise.
 
-    Six numbers a pose in place of one always fit a little better; that much is taken out. Before a resting camera.
+    Six numbers a pose in place of one always fit a little better; that much is taken out.
 
     Args:
         b: the fitted joint.  s: its observations, (n, T).
@@ -88,6 +88,8 @@ def looser(b: Bundle, s: Sightings) -> float | None:
     focal = s.focal * float(np.exp(b.log_focal))
     R, shift = b.twist.pose(b.q[some])
     t = b.twist.anchor + shift - R @ b.twist.anchor
+    if s.R is not None and s.t is not None:
+        R, t = s.R[some] @ R, np.einsum("tij,tj->ti", s.R[some], t) + s.t[some]
     on_joint = np.where(seen[..., None], residuals(b, s)[ids][:, some], 0.0)
     x = np.where(seen[..., None], s.uv[ids][:, some], np.nan) / focal
     _, _, _, free = adjust(x, seen, R, t, b.X[ids], focal, iterations=25)

@@ -35,6 +35,8 @@ MIN_COMMON = 8
 FLEX_PX, FLEX_SIGMAS = 1.0, 4.0
 """How far real parts flex and tracks drift together without a residual that shows it, once errors are seen to be shared
 at all: so many working px, and no more than so many times the noise that is seen."""
+RELATIVE = (0.05, 3.0)
+"""Least and most noise of a scene over the link's that is believed."""
 MOST_FRAMES, MOST_TRACKS = 220, 400
 """Bounds of one bundle adjustment; further frames get their state afterwards, further tracks their point."""
 FREE_FRAMES, MOST_STILL = 100, 200
@@ -73,10 +75,15 @@ class Still:
 
     Attributes:
         ids: (m,) its tracks.  X: (m, 3) their points in the world.
+        known: whether it is known that these rest; else the smoother path of the camera decides.
+        sigma: noise of one coordinate, px; like the link's when None. Real links flex, blur and are cast into shade: a
+            path that is held no better than the link bends after it.
     """
 
     ids: np.ndarray
     X: np.ndarray
+    known: bool = False
+    sigma: float | None = None
 
 
 def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
@@ -216,7 +223,8 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     if still is None:
         best = {k: polish(b, few, iterations=30) for k, b in best.items()}
     else:
-        rest = Still(np.setdiff1d(still.ids, members), still.X[~np.isin(still.ids, members)])
+        apart = ~np.isin(still.ids, members)
+        rest = replace(still, ids=still.ids[apart], X=still.X[apart])
         best, few = _together(best, few, uv, rest, view)
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
@@ -277,12 +285,17 @@ def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: 
     """Joint and camera in one bundle adjustment: the bundles with the scene's points and poses, and its sightings."""
     pick = _spread_out(len(still.ids), MOST_STILL)
     scene = view.sightings(uv[still.ids[pick]], sight.frames)
+    relative = np.ones(len(sight.uv) + len(pick))
+    if still.sigma is not None:
+        moving = max(min(b.sigma for b in best.values()), 0.05)
+        relative[len(sight.uv):] = np.clip(max(still.sigma, 0.05) / moving, *RELATIVE)
     both = replace(
         sight,
         uv=np.concatenate([sight.uv, scene.uv]),
         seen=np.concatenate([sight.seen, scene.seen]),
         weight=np.concatenate([sight.weight, scene.weight]),
         link=np.arange(len(sight.uv) + len(pick)) < len(sight.uv),
+        relative=relative,
         free=True,
     )
     start = {k: replace(b, X=np.concatenate([b.X, still.X[pick]]), R=scene.R, t=scene.t) for k, b in best.items()}
@@ -302,7 +315,7 @@ def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, uv: np.
     out = {
         k: states_of_all_frames(replace(b, X=b.X[link], R=None, t=None), seen, sight.frames) for k, b in best.items()
     }
-    if still is None or every.R is None or every.t is None:
+    if still is None or still.known or every.R is None or every.t is None:
         return out, members, still, every
     b = best[kind]
     if b.R is None or b.t is None or rougher((b.R, b.t), before_the_link(b.twist, b.q, b.R, b.t), b.twist.anchor):

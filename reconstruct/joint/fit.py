@@ -13,6 +13,7 @@ from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import bridged, free_motion, looser
 from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Still, View, finish, turn_deg
 from reconstruct.joint.groups import two_bodies
+from reconstruct.joint.handheld import before_the_hand, filmed, path_from_rest
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
 from reconstruct.joint.select import distinct, explained, key_frames, motion_stretches, observations, search
@@ -99,13 +100,39 @@ def fit_joint(
         return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members))
     tell(0.9)
 
-    restless = _restlessness(uv, camera, DEPTHS if video.stabilised else 0.5)
-    view = replace(view, restless=restless if video.stabilised and np.isfinite(restless) else 0.0)
-    done = finish(found.starts, uv - camera.centre, found.members, view)
+    if video.warp is None:
+        restless = _restlessness(uv, camera, 0.5)
+        done = finish(found.starts, uv - camera.centre, found.members, view)
+    else:
+        done, restless, words = _hand_held(found, uv, video.warp, view, camera)
+        note += words
     tell(1.0)
     if reason := _why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
+
+
+def _hand_held(found: _Consensus, uv: np.ndarray, warp: np.ndarray, view: View, camera: _Camera
+               ) -> tuple[Finished, float, str]:  # fmt: skip
+    """The joint before a camera held in a hand, whose path is fitted with it where enough of the scene rests.
+
+    Args:
+        uv: (N, T, 2) working px in the compensated picture.  warp: (T, 3, 3) as in :class:`Video`.
+
+    Returns:
+        The joint, by how much points at rest miss their place, px, and words for the result.
+    """
+    still, filmed_uv = uv - camera.centre, filmed(uv, warp) - camera.centre
+    rest = np.setdiff1d(np.arange(len(uv)), np.concatenate([_moving(uv, camera.diagonal), found.members]))
+    path = path_from_rest(filmed_uv, still, rest, camera.focal)
+    if path is None:
+        restless = _restlessness(uv, camera, DEPTHS)
+        view = replace(view, restless=restless if np.isfinite(restless) else 0.0)
+        return finish(found.starts, still, found.members, view), restless, "; the camera moves: taken to its first view"
+    leading = next(iter(found.starts.values()))[0]
+    view, scene = before_the_hand(path, leading, filmed_uv, found.members, view)
+    done = finish(found.starts, filmed_uv, found.members, view, scene)
+    return done, path.sigma, "; the camera moves: its path is fitted together with the joint"
 
 
 @dataclass(frozen=True)
@@ -122,7 +149,8 @@ class _Consensus:
     """The best joint of both types and the tracks that follow it, or why there is none.
 
     Attributes:
-        starts: per type, states with depths of the following tracks, and their key-frame observations; best first.
+        starts: per type, states with depths of the following tracks, and their key-frame observations; the type
+            that named the tracks first, and of each type the best first.
         members: (n,) indices of these tracks.
         explained: motion of all tracks that it explains.
         refusal: a sentence, or "".  scattered: True if too few tracks agree on anything.
@@ -189,8 +217,8 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
         follows = share > 0.5
         link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
                             every.frames)  # fmt: skip
-        starts = {k: [(_redepth(b, link), link)] for k, b in best.items()}
-        starts[kind] = [(replace(s, depth=s.depth[follows]), link)]
+        starts = {kind: [(replace(s, depth=s.depth[follows]), link)]}
+        starts |= {k: [(_redepth(b, link), link)] for k, b in best.items() if k != kind}
         # Hinges that lean to either side of the viewing ray may explain nearly the same: the last digits tell.
         if "revolute" in best:
             near = [h for h in ranked if h.kind == "revolute" and explained(h, obs)[0] > RIVAL * worth["revolute"]]
@@ -268,7 +296,7 @@ def _why_not_believed(done: Finished, restlessness: float = np.inf) -> str | Non
             f"no joint: from one state to the next the best one ({done.bundle.kind}) misses {b.error:.0%} of the way "
             "that its own points go"
         )
-    misses = done.sight.R is None and done.bundle.sigma > RESTLESS * restlessness
+    misses = done.bundle.sigma > RESTLESS * restlessness
     times = looser(done.bundle, done.sight) if misses else None
     if times is not None and times > LOOSER:
         return (

@@ -103,7 +103,7 @@ def rigid_group(uv: np.ndarray, focal: float, candidates: np.ndarray, seed: int 
         if len(patch) < 8:
             continue
         for R, t in paths_of_patch(xk[patch], seen[patch], r, focal):
-            X = _triangulated(xk, seen, R, t)
+            X = triangulated(xk, seen, R, t)
             loss = _track_cost(xk, seen, R, t, X, focal, 6.0)
             starts.append((float(np.sum((1 - loss) * seen.sum(1))), R, t, patch))
     starts.sort(key=lambda s: -s[0])
@@ -193,7 +193,7 @@ def paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep: 
     for s in best:
         points, rotation, shift = X[s], R[s], t[s]
         for _ in range(3):
-            points = _triangulated(x, seen, rotation, shift, points)
+            points = triangulated(x, seen, rotation, shift, points)
             rotation, shift, _ = resect(points[None], x.swapaxes(0, 1), seen.T, rotation, shift, focal, 3)
         out.append((rotation, shift))
     return out
@@ -235,7 +235,7 @@ def resect(X: np.ndarray, x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.
     return R, t, loss
 
 
-def _triangulated(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray | None = None,
+def triangulated(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray | None = None,
                   px: float = 0.006) -> np.ndarray:  # fmt: skip
     """(N, 3) points from poses: linear over all frames, reweighted by depth and residual.
 
@@ -310,12 +310,12 @@ def _grow(x, seen, R, t, patch, focal) -> tuple[float, np.ndarray, np.ndarray, n
         m = np.flatnonzero(members)
         if len(m) > 100:
             m = m[np.linspace(0, len(m) - 1, 100).round().astype(int)]
-        P = _triangulated(x[m], seen[m], R, t)
+        P = triangulated(x[m], seen[m], R, t)
         for _ in range(2):
             R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 3)
-            P = _triangulated(x[m], seen[m], R, t, P)
+            P = triangulated(x[m], seen[m], R, t, P)
         R, t, _, sigma = adjust(x[m], seen[m], R, t, P, focal, iterations=4)
-        X = _triangulated(x, seen, R, t)
+        X = triangulated(x, seen, R, t)
         # What a small neighbourhood leaves open is small near it: the body grows as its path becomes known.
         limit = max(2.5 * sigma, (3.0, 2.5, 2.0)[min(k, 2)])
         members = _members(x, seen, R, t, X, focal, limit)
@@ -340,13 +340,13 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
             return None
         if len(m) > 150:
             m = m[np.linspace(0, len(m) - 1, 150).round().astype(int)]
-        P = _triangulated(x[m], seen[m], R, t)
+        P = triangulated(x[m], seen[m], R, t)
         if k == 0:
             for _ in range(2):
                 R, t, _ = resect(P[None], x[m].swapaxes(0, 1), seen[m].T, R, t, focal, 2)
-                P = _triangulated(x[m], seen[m], R, t, P)
+                P = triangulated(x[m], seen[m], R, t, P)
         R, t, P, sigma = adjust(x[m], seen[m], R, t, P, focal, iterations=8)
-        X = _triangulated(x, seen, R, t)
+        X = triangulated(x, seen, R, t)
         fits = _members(x, some, R, t, X, focal, max(2.5 * sigma, 1.0)) & (X[:, 2] > 0.02)
         slow = _slow(x, some, R, t, X, focal, max(sigma, 0.1))
         # Real errors last: then the better half sets the measure. Of two bodies in one it is nearer to one of them.

@@ -34,6 +34,7 @@ class Sightings:
         frames: (T,) frame numbers; 0 .. T-1 when None.
         lasting: frames over which a track's error stays alike: so many observations weigh against a prior as one.
         link: (N,) bool, on the link (the others rest); all of them when None.
+        relative: (N,) noise over that of the link's tracks; 1 when None.
         free: True if the camera's poses are unknown, R and t but a start; the world is the first camera then.
     """
 
@@ -47,6 +48,7 @@ class Sightings:
     frames: np.ndarray | None = None
     lasting: float = 1.0
     link: np.ndarray | None = None
+    relative: np.ndarray | None = None
     free: bool = False
 
     @property
@@ -70,7 +72,7 @@ class Bundle:
     Attributes:
         kind: "revolute", "prismatic" or "screw".  twist: the joint.  q: (T,) path length at the anchor, q[0] = 0.
         X: (N, 3) points at q = 0, world.  log_focal: correction of the focal length's logarithm.
-        cost: robust cost in px^2.  sigma: noise of one coordinate, px.
+        cost: robust cost in px^2.  sigma: noise of one coordinate of the link's tracks, px.
         R, t: world to camera where the poses are fitted too, else None.
     """
 
@@ -123,10 +125,17 @@ def noise(r: np.ndarray, seen: np.ndarray) -> float:
     return float(np.sqrt(max(np.median(r2) / (2 * np.log(2)), 1e-6))) if len(r2) else 1.0
 
 
+def link_noise(r: np.ndarray, s: Sightings) -> float:
+    """That of the link's tracks, px: a scene that rests may be far more exact, and is no measure of them."""
+    return noise(r, s.seen) if s.link is None else noise(r[s.link], s.seen[s.link])
+
+
 def robust_loss(r: np.ndarray, s: Sightings, scale: float) -> tuple[float, np.ndarray]:
-    g = scale**2 / (scale**2 + np.sum(r**2, axis=-1))
+    """Cost, and the weight (N, T) of every squared residual in the linear problem that has the same gradient."""
+    by = np.ones(len(r)) if s.relative is None else 1 / s.relative**2
+    g = scale**2 / (scale**2 + by[:, None] * np.sum(r**2, axis=-1))
     w = s.weight[:, None] * s.seen
-    return float(np.sum(w * scale**2 * (1 - g))), w * g**2
+    return float(np.sum(w * scale**2 * (1 - g))), w * by[:, None] * g**2
 
 
 @dataclass(frozen=True)
@@ -265,7 +274,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
     world, cam = positions(b, s)
     r = residuals(b, s, cam)
     for stage in range(2 if sharpen else 1):
-        sigma = noise(r, s.seen)
+        sigma = link_noise(r, s)
         limit = scale or ROBUST_SIGMAS * max(sigma, 0.05) * (2.0 if sharpen and stage == 0 else 1.0)
         damping = 1e-4
         pull, row = _prior(b, s, sigma**2)
@@ -305,7 +314,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
                 damping = max(damping * 10, 1e-6)
             if not better:
                 break
-    return replace(b, cost=cost, sigma=noise(r, s.seen))
+    return replace(b, cost=cost, sigma=link_noise(r, s))
 
 
 def _stepped(b: Bundle, n: Normal, step: np.ndarray, dX: np.ndarray, row: int) -> Bundle:

@@ -173,10 +173,11 @@ def spread(b: Bundle, s: Sightings) -> Spread:
 
     by_d, by_w = np.zeros((3, len(S))), np.zeros((3, len(S)))
     by_d[:, :G], by_w[:, :G] = n.Z[:3], n.Z[3:]
-    # Mean depth of the link's points, the unit of length.
-    unit = float(b.X[link, 2].mean())
-    by_unit = -np.einsum("nj,pnj->p", inv[link, 2], n.C[:, link]) / link.sum()
-    own = white * float(inv[link, 2, 2].sum()) / link.sum() ** 2
+    # Mean depth of the link's points, the unit of length; each as much as it counts: nothing holds one that strayed.
+    share = w.sum(1) * link / max(float(w[link].sum()), 1e-12)
+    unit = float(share @ b.X[:, 2])
+    by_unit = -np.einsum("n,nj,pnj->p", share, inv[:, 2], n.C, optimize=True)
+    own = white * float(share**2 @ inv[:, 2, 2])
     by_q = np.zeros((T, len(S)))
     by_q[np.arange(T), A + np.arange(T)] = 1.0
     if not s.scaleless:
