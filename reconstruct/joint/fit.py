@@ -13,7 +13,7 @@ from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import bridged, free_motion, looser
 from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Still, View, finish, turn_deg
 from reconstruct.joint.groups import two_bodies
-from reconstruct.joint.handheld import before_the_hand, filmed, path_from_rest
+from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
 from reconstruct.joint.select import distinct, explained, key_frames, motion_stretches, observations, search
@@ -130,7 +130,7 @@ def _hand_held(found: _Consensus, uv: np.ndarray, warp: np.ndarray, view: View, 
         view = replace(view, restless=restless if np.isfinite(restless) else 0.0)
         return finish(found.starts, still, found.members, view), restless, "; the camera moves: taken to its first view"
     leading = next(iter(found.starts.values()))[0]
-    view, scene = before_the_hand(path, leading, filmed_uv, found.members, view)
+    view, scene = scaled_to_link(path, leading, filmed_uv, found.members, view)
     done = finish(found.starts, filmed_uv, found.members, view, scene)
     return done, path.sigma, "; the camera moves: its path is fitted together with the joint"
 

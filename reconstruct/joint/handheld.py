@@ -68,7 +68,7 @@ def path_from_rest(uv: np.ndarray, still: np.ndarray, rest: np.ndarray, focal: f
         rest: (m,) the tracks that rest.  focal: px.
 
     Returns:
-        None where fewer than LEAST tracks last, or some frame sees none of them.
+        None where fewer than LEAST tracks last, or some frame sees fewer than MIN_SEEN of them.
     """
     T = uv.shape[1]
     ids = rest[np.isfinite(uv[rest][..., 0]).mean(1) >= LASTING]
@@ -111,13 +111,17 @@ def _off(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.nd
     return out
 
 
-def before_the_hand(path: Path, start: tuple[State, Observations], uv: np.ndarray, members: np.ndarray, view: View
-                    ) -> tuple[View, Still]:  # fmt: skip
-    """View and scene in the link's unit: the ratio of depths with which the joint found so far fits best.
+def scaled_to_link(path: Path, start: tuple[State, Observations], uv: np.ndarray, members: np.ndarray, view: View
+                   ) -> tuple[View, Still]:  # fmt: skip
+    """Camera and scene with the link's median depth as the unit: at the ratio of depths at which the joint fits best.
 
     Args:
-        start: of :func:`reconstruct.joint.finish.finish`, of the tracks ``members``.
+        start: the joint found so far and its key-frame observations, of the tracks ``members`` (n,).
         uv: (N, T, 2) px from the principal point, as filmed.
+        view: focal length; its camera is replaced.
+
+    Returns:
+        The view with the path, (T, 3, 3) and (T, 3), and the scene that rests.
     """
     some = np.unique(np.linspace(0, uv.shape[1] - 1, FEW_FRAMES).round().astype(int))
     b = bundle_of_state(*start, some)
