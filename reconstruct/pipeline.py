@@ -298,24 +298,24 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
 
 def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float | None, seed: int,
                       progress: Callable[[float], None]) -> JointFit:  # fmt: skip
-    """The joint without depth; where a forearm is what was found, or may hide it, that without the arms' tracks."""
+    """The joint without depth, from the tracks that are on no forearm.
+
+    Sleeves often have more tracks than the part, and go nearly as it goes. Where nothing is found without them and
+    they were many, the wedge of an arm may have held the part: then all tracks are asked, and a joint that is not
+    mostly an arm's counts.
+    """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.fit import fit_joint, moving_tracks
 
-    fit = fit_joint(video, tracks, focal, seed, progress, camera_moving=False)
     arm = on_forearm(tracks, hands)
-    if fit.verdict == "refused":
-        moving = moving_tracks(video, tracks)
-        if not len(moving) or np.mean(arm[moving]) < ARM_SHARE:
-            return fit
-    elif np.mean(arm[fit.point_track]) < 0.5:
-        return fit
-    rest = replace(tracks, visible=tracks.visible & ~arm[:, None])
-    again = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
-    if fit.verdict == "refused" and again.verdict == "refused":
-        return fit
+    share = float(np.mean(arm[moving])) if len(moving := moving_tracks(video, tracks)) else 0.0
+    rest = replace(tracks, visible=tracks.visible & ~arm[:, None]) if share > 0 else tracks
+    fit = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
+    if fit.verdict == "refused" and share >= ARM_SHARE:
+        again = fit_joint(video, tracks, focal, seed, progress, camera_moving=False)
+        return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again
     # No semicolon: what follows one is advice.
-    return replace(again, reason=f"without the arm that moved most, {again.reason}")
+    return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
 
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,

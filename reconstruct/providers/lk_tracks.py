@@ -1,10 +1,10 @@
 """Point tracks by pyramidal Lucas-Kanade from many reference frames, in both directions of time.
 
 One reference frame is a lottery: a closed door may have no texture where the open one has a rack of
-corners. Corners are therefore seeded in every reference frame, wherever the picture ever changes, and
-followed forwards and backwards through the whole video. Every step is checked by tracking back, and
-each point is re-registered against the last frame in which it was well anchored (affine.py), so that errors
-do not pile up frame by frame.
+corners. Corners are therefore seeded in every reference frame, wherever the picture ever changes and some
+in what changing places enclose, and followed forwards and backwards through the whole video. Every step is
+checked by tracking back, and each point is re-registered against the last frame in which it was well anchored
+(affine.py), so that errors do not pile up frame by frame.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ ANCHOR_PX = 2.0
 ALIKE, STRETCH = 0.8, 2.0
 """Correlation with the anchor frame, and stretch of its neighbourhood, up to which it stays the anchor."""
 CHANGE_GREY = 18.0
+INNER_SEEDS, INNER_EVERY = 120, 3
+"""Seeds in what changing pixels enclose, in every third reference frame."""
 
 
 def reference_frames(video: Video, hands: Hands | None = None, count: int = 18) -> np.ndarray:
@@ -91,6 +93,19 @@ def change_region(video: Video, dilate: int = 9) -> np.ndarray:
     return cv2.dilate(region, np.ones((2 * dilate + 1,) * 2, np.uint8)) > 0
 
 
+def enclosed(region: np.ndarray) -> np.ndarray:
+    """(h, w) bool, what the pieces of a region enclose, without the region: a door of even colour that opens a little
+    changes the picture at its rim only, but the points near its hinge hold the axis best."""
+    import cv2
+
+    out = np.zeros(region.shape, np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8))
+    for k in range(1, len(stats)):
+        y, x = np.nonzero(labels == k)
+        cv2.fillConvexPoly(out, cv2.convexHull(np.stack([x, y], axis=1).astype(np.int32)), 1)
+    return (out > 0) & ~region
+
+
 def track_points(
     video: Video,
     hands: Hands | None = None,
@@ -120,9 +135,12 @@ def track_points(
         covered = np.stack([cv2.dilate(m.astype(np.uint8), k) for m in hands.mask]) > 0
     grey = np.stack(even_exposure(video))
     seeds, frames = [], []
-    for r in references:
-        mask = region if covered is None else region & ~covered[r]
-        p = _corners(grey[r], mask, per_reference)
+    inner = enclosed(region)
+    for k, r in enumerate(references):
+        free = np.ones_like(region) if covered is None else ~covered[r]
+        p = _corners(grey[r], region & free, per_reference)
+        if k % INNER_EVERY == 0:
+            p = np.concatenate([p, _corners(grey[r], inner & free, INNER_SEEDS)])
         seeds.append(p)
         frames.append(np.full(len(p), r))
     start = np.concatenate(seeds) if seeds else np.zeros((0, 2), np.float32)

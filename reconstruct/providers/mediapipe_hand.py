@@ -4,11 +4,15 @@ The palm detector looks at the whole frame and at overlapping square tiles every
 tracklet explains starts one, which the landmark network carries forwards and backwards, each frame's landmarks giving
 the next frame's region, until the network says that no hand is there. Because the video is complete, nothing has to be
 decided on the fly: tracklets are linked and gated only when all are known.
+
+The palm detector needs a palm. Of a hand that reaches in from the picture's edge often only fingers are seen, so a
+second look is taken at the picture with its edge pixels repeated outwards, where the networks complete such a hand. Its
+landmarks are half a guess: it counts for the mask of hands, which keeps point tracks off it, and not as a hand track.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,6 +37,7 @@ KEEP_PRESENCE = 0.5  # to go on
 DETECT_EVERY = 4  # frames
 MIN_SECONDS = 0.3  # a hand that was seen for less is not reported
 MAX_HANDS = 3
+WIDER = (0.5, 1.0)  # of the frame's short side are added on every side to find hands at the picture's edge
 Palm = tuple[float, np.ndarray, np.ndarray]  # score, box (cx, cy, w, h), points (7, 2)
 BONES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 6), (6, 7), (7, 8), (9, 10), (10, 11), (11, 12), (13, 14), (14, 15),
          (15, 16), (17, 18), (18, 19), (19, 20), (0, 1), (1, 2), (2, 3), (3, 4))  # fmt: skip
@@ -195,7 +200,7 @@ def _squares(height: int, width: int) -> list[tuple[float, float, float]]:
     return out
 
 
-@dataclass
+@dataclass(eq=False)
 class _Tracklet:
     uv: dict[int, np.ndarray] = field(default_factory=dict)
     metric: dict[int, np.ndarray] = field(default_factory=dict)
@@ -230,14 +235,14 @@ def _plausible(uv: np.ndarray, shape: tuple[int, ...]) -> bool:
     return inside >= 0.6 and longest < 2.5 * _size(uv)
 
 
-def _follow(networks: _Networks, video: Video, tracklet: _Tracklet, start: int, step: int,
+def _follow(networks: _Networks, frames: Sequence[np.ndarray], tracklet: _Tracklet, start: int, step: int,
             claimed: list[_Tracklet]) -> None:
     t = start + step
-    while 0 <= t < len(video):
+    while 0 <= t < len(frames):
         here = tracklet.uv[t - step]
         shift = here - tracklet.uv[t - 2 * step] if t - 2 * step in tracklet.uv else 0.0
         shift = np.median(shift, axis=0) if np.ndim(shift) else 0.0
-        image = video.frames[t]
+        image = frames[t]
         presence, right, uv, metric = networks.landmarks(image, _region_from_landmarks(here + shift))
         if presence < KEEP_PRESENCE and np.ndim(shift):  # the hand may have stopped
             presence, right, uv, metric = networks.landmarks(image, _region_from_landmarks(here))
@@ -268,15 +273,66 @@ def _explains(uv: np.ndarray, palm_points: np.ndarray) -> bool:
     return bool(np.linalg.norm(uv[[0, 5, 9, 13, 17]].mean(0) - palm_points[:5].mean(0)) < 0.6 * _size(uv))
 
 
-def _find_tracklets(networks: _Networks, video: Video, progress: Callable[[float], None] | None) -> list[_Tracklet]:
+@dataclass(frozen=True)
+class _Widened(Sequence):
+    """Frames with their edge pixels repeated outwards by `margin`; made one at a time."""
+
+    frames: np.ndarray
+    margin: int
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, t):
+        m = self.margin
+        return np.pad(self.frames[t], ((m, m), (m, m), (0, 0)), mode="edge")
+
+
+def _beyond_the_edge(networks: _Networks, video: Video, hands: list[_Tracklet], rate: float) -> list[_Tracklet]:
+    """Hands of which not the whole palm is in the picture and that are not among `hands`.
+
+    Where there is nobody else to be found the look is as close as the first, and a wider one follows.
+    """
     h, w = video.frames.shape[1:3]
-    squares = _squares(h, w)
+    every = 2 * DETECT_EVERY if hands else DETECT_EVERY
+    for share in WIDER:
+        wide = _Widened(video.frames, round(share * min(h, w)))
+        found = [k for k in _find_tracklets(networks, wide, None, every) if k.uv]
+        out = [k for k in found if _grade(k, rate) == 2]
+        # One that passes for a hand vouches for the weaker stretches that continue it.
+        for k in sorted(found, key=lambda k: -len(k.uv)):
+            if k not in out and any(_continues(k, sure) for sure in out):
+                out.append(k)
+        for k in out:
+            k.uv = {t: uv - wide.margin for t, uv in k.uv.items()}
+            for t in [t for t in k.uv if any(t in o.uv and _same_place(k.uv[t], o.uv[t]) for o in hands)]:
+                k.drop(t)
+        palms = [uv[[0, 5, 9, 13, 17]] for k in out for uv in k.uv.values()]
+        if any(((p < 0) | (p > (w - 1, h - 1))).any() for p in palms):
+            return [k for k in out if k.uv]
+        if hands:
+            break
+    return []
+
+
+def _continues(k: _Tracklet, sure: _Tracklet) -> bool:
+    """Does one stretch begin or end where and when the other ends or begins?"""
+    for end, step in ((k.span[0], -1), (k.span[1], 1)):
+        for t in (end + step, end + 2 * step, end + 3 * step):
+            if t in sure.uv and np.linalg.norm(k.uv[end].mean(0) - sure.uv[t].mean(0)) < _size(sure.uv[t]):
+                return True
+    return False
+
+
+def _find_tracklets(networks: _Networks, frames: Sequence[np.ndarray], progress: Callable[[float], None] | None,
+                    every: int = DETECT_EVERY) -> list[_Tracklet]:  # fmt: skip
+    squares = _squares(*frames[0].shape[:2])
     tracklets: list[_Tracklet] = []
-    for t in range(0, len(video), DETECT_EVERY):
-        image = video.frames[t]
+    for t in range(0, len(frames), every):
+        image = frames[t]
         seen: set[int] = set()
         # Whole frame always, tiles in turns: every place is looked at several times a second.
-        turn = (t // DETECT_EVERY) % 2
+        turn = (t // every) % 2
         for square in squares[:1] + squares[1 + turn :: 2]:
             for _, box, points in networks.palms(image, square):
                 known = [i for i, k in enumerate(tracklets) if t in k.uv and _explains(k.uv[t], points)]
@@ -291,8 +347,8 @@ def _find_tracklets(networks: _Networks, video: Video, progress: Callable[[float
                 if any(t in k.uv and _same_place(uv, k.uv[t]) for k in tracklets):
                     continue
                 new = _Tracklet({t: uv}, {t: metric}, {t: presence}, {t: right})
-                _follow(networks, video, new, t, 1, tracklets)
-                _follow(networks, video, new, t, -1, tracklets)
+                _follow(networks, frames, new, t, 1, tracklets)
+                _follow(networks, frames, new, t, -1, tracklets)
                 tracklets.append(new)
                 seen.add(len(tracklets) - 1)
         for i, k in enumerate(tracklets):
@@ -300,7 +356,7 @@ def _find_tracklets(networks: _Networks, video: Video, progress: Callable[[float
                 k.looks += 1
                 k.palms += i in seen
         if progress:
-            progress((t + 1) / len(video))
+            progress((t + 1) / len(frames))
     return tracklets
 
 
@@ -328,9 +384,7 @@ def _select(tracklets: list[_Tracklet], rate: float) -> list[_Tracklet]:
     grades = [_grade(k, rate) if k.uv else 0 for k in tracklets]
     out = [k for k, grade in zip(tracklets, grades, strict=True) if grade == 2]
     for k in (k for k, grade in zip(tracklets, grades, strict=True) if grade == 1):
-        ends = ((k.span[0], -1), (k.span[1], 1))
-        if any(end + step * d in sure.uv and np.linalg.norm(k.uv[end].mean(0) - sure.uv[end + step * d].mean(0))
-               < _size(sure.uv[end + step * d]) for sure in out for end, step in ends for d in (1, 2, 3)):  # fmt: skip
+        if any(_continues(k, sure) for sure in out):
             out.append(k)
     return out
 
@@ -380,14 +434,15 @@ def detect_hands(video: Video, progress: Callable[[float], None] | None = None) 
         progress: called with the fraction done.
 
     Returns:
-        Up to three hands with landmarks in full px and metric landmarks, and the mask of hands and bare arms.
-        No hand at all gives an empty tuple and an empty mask.
+        Up to three hands with landmarks in full px and metric landmarks, and the mask of hands and bare arms, those
+        of which only fingers reach into the picture included. No hand at all gives an empty tuple and an empty mask.
 
     Raises:
         TaaError: the networks cannot be fetched (offline on first use).
     """
     networks = _Networks()
     rate = (len(video) - 1) / max(float(video.time[-1] - video.time[0]), 1e-6)
-    tracklets = _select(_find_tracklets(networks, video, progress), rate)
+    tracklets = _select(_find_tracklets(networks, video.frames, progress), rate)
     tracks = tuple(_link(tracklets, video, rate))
-    return Hands(tracks, hand_mask(video, tracks), INFO)
+    cut = tuple(_as_track([k], video) for k in _beyond_the_edge(networks, video, tracklets, rate))
+    return Hands(tracks, hand_mask(video, tracks + cut), INFO)

@@ -45,27 +45,38 @@ def test_only_what_stays_beyond_the_wrist(turn):
     assert not on_forearm(tracks, Hands((), hands.mask, MADE)).any()
 
 
-@pytest.mark.parametrize("share", [0.1, 0.4])
-def test_where_an_arm_may_hide_the_joint_it_is_sought_without_it(share, monkeypatch):
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+def test_the_joint_is_sought_off_the_arm(share, monkeypatch):
     """Which tracks the search is given, not the search: `benchmarks.articulation --rows 4` has rendered sleeves."""
+    fit, asked, arms = _asked(share, monkeypatch, refuses=lambda arms: arms)
+    assert fit.verdict == "ok" and len(asked) == 1 and np.array_equal(asked[0], ~arms)
+    assert fit.reason == ("without what is on an arm, found" if share >= ARM_SHARE else "found")
+
+
+@pytest.mark.parametrize("share, on_the_arm", [(0.1, False), (0.4, False), (0.4, True)])
+def test_a_part_in_the_wedge_is_found_all_the_same_and_an_arm_is_none(share, on_the_arm, monkeypatch):
+    fit, asked, arms = _asked(share, monkeypatch, refuses=lambda arms: not arms, on_the_arm=on_the_arm)
+    assert np.array_equal(asked[0], ~arms) and (len(asked) == 2) == (share >= ARM_SHARE)
+    if share >= ARM_SHARE:
+        assert asked[1].all()
+    assert fit.verdict == ("ok" if share >= ARM_SHARE and not on_the_arm else "refused")
+
+
+def _asked(share, monkeypatch, refuses, on_the_arm=False):
+    """The answer of a search that refuses with or without an arm's tracks, what it was given, which are on the arm."""
     hands, wrist, along = hand_path(0.3)
     rng = np.random.default_rng(0)
     sleeve = wrist + (rng.uniform(30, 250, (int(100 * share), 1)) * along)[:, None]
     held = wrist - (rng.uniform(90, 250, (100 - len(sleeve), 1)) * along)[:, None]
     uv = np.concatenate([sleeve, held]).astype(np.float32)
     tracks = Tracks(uv, np.ones(uv.shape[:2], bool), np.zeros(100, int), MADE)
-    asked = []
+    arms, asked = np.arange(100) < len(sleeve), []
 
-    def refusing_arms(video, tracks, focal, seed, progress, camera_moving):
+    def search(video, tracks, focal, seed, progress, camera_moving):
         asked.append(tracks.visible.any(1))
-        arms = asked[-1][: len(sleeve)].any()
-        return JointFit("refused", "a free body") if arms else JointFit("ok", "found", "revolute")
+        if refuses(bool(asked[-1][arms].any())):
+            return JointFit("refused", "a free body")
+        return JointFit("ok", "found", "revolute", point_track=np.flatnonzero(arms if on_the_arm else ~arms))
 
-    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", refusing_arms)
-    fit = joint_off_the_arm(make_video(T), tracks, hands, None, 0, lambda _: None)
-    if share < ARM_SHARE:
-        assert (fit.verdict, fit.reason, len(asked)) == ("refused", "a free body", 1)
-    else:
-        assert (fit.verdict, fit.reason) == ("ok", "without the arm that moved most, found")
-        assert len(asked) == 2 and asked[0].all()
-        assert np.array_equal(asked[1], np.arange(100) >= len(sleeve))
+    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", search)
+    return joint_off_the_arm(make_video(T), tracks, hands, None, 0, lambda _: None), asked, arms

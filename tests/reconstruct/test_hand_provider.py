@@ -1,5 +1,6 @@
 """The hand provider on the shared clips, and its geometry on numbers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from reconstruct.errors import TaaError
 from reconstruct.providers import mediapipe_hand as provider
 from reconstruct.providers import weights
-from reconstruct.video import load_video
+from reconstruct.video import Video, load_video
 
 VIDEOS = Path(__file__).parents[2].parent / "shared" / "data" / "videos"
 
@@ -59,7 +60,9 @@ def test_overlapping_palms_become_one() -> None:
 
 
 def test_a_clip_without_a_hand_has_none() -> None:
-    hands = provider.detect_hands(load_video(clip("microwave.mp4")))
+    video = load_video(clip("microwave.mp4"))
+    third = replace(video, frames=video.frames[::3], time=video.time[::3], index=video.index[::3])
+    hands = provider.detect_hands(third)
     assert hands.tracks == ()
     assert not hands.mask.any()
 
@@ -113,3 +116,24 @@ def test_palms_are_looked_for_in_pictures_of_any_size(width: int, height: int) -
     image = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
     for square in provider._squares(height, width):
         assert isinstance(networks.palms(image, square), list)
+
+
+def test_fingers_at_the_picture_s_edge_are_masked_though_no_palm_is_seen() -> None:
+    """A chair's seat is tilted by a hand of which nothing but the fingers is in the picture."""
+    from benchmarks.articulation.__main__ import _models
+    from benchmarks.articulation.motions import SIZE, shoot
+    from benchmarks.articulation.pixels import pictures
+    from benchmarks.articulation.scenes import rng_of
+
+    model, rng = _models()["foldchair"], rng_of(7, "foldchair", "pause", "rich", "small")
+    shot = shoot(model, "pause", False, True, 48, rng)
+    images = pictures(model, replace(shot, q=shot.q[:12], T_world_camera=shot.T_world_camera[:12]), "rich", rng)
+    video = Video(Path("rendered.mp4"), "0" * 64, SIZE, np.arange(12) / 24, np.arange(12), 12, images[..., ::-1], 1.0)
+    hands = provider.detect_hands(video)
+    assert hands.tracks == ()
+    # Skin is reddish; the seat is green, the wall nearly grey, stickers are no fingers and stay free.
+    fingers = images[:, -60:, 200:440].astype(int)
+    skin = (fingers[..., 0] - fingers[..., 2] > 50) & (fingers[..., 0] > 130)
+    assert skin.mean() > 0.05
+    assert hands.mask[:, -60:, 200:440][skin].mean() > 0.9
+    assert hands.mask.mean() < 0.1

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo
-from reconstruct.providers.lk_tracks import change_region, even_exposure, reference_frames, track_points
+from reconstruct.providers.lk_tracks import change_region, enclosed, even_exposure, reference_frames, track_points
 from tests.reconstruct.joint_scenes import make_video
 from tests.reconstruct.textures import turning_plate
 
@@ -69,3 +69,11 @@ def test_exposure_jumps_do_not_drag_points():
         np.array_equal(level[0], cv2.cvtColor(noisy[0], cv2.COLOR_BGR2GRAY)) or np.abs(level[0] - level[1]).mean() < 4
     )
     assert change_region(video).mean() < 0.1
+
+
+def test_what_the_rim_encloses_is_seeded_too():
+    ring = np.zeros((120, 160), bool)
+    ring[20:100, 30:36] = ring[20:26, 30:120] = True
+    inside = enclosed(ring)
+    assert inside[30:50, 40:80].all() and not (inside & ring).any()
+    assert not inside[:18].any() and not inside[60:, 100:].any()
