@@ -7,18 +7,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
+from scipy.special import expit
 
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.cameras import before_the_link, rougher
-from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities
+from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities, tempered, votes
 from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
     Bundle,
     Sightings,
+    anchor_of,
     place_points,
     polish,
+    radius_cost,
     residuals,
     robust_loss,
+    track_costs,
 )
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import (
@@ -46,8 +50,23 @@ COARSE_FRAMES = 40
 SCREW_TURN_DEG, FREE_BODY = 120.0, 0.95
 """Between two poses every rigid motion is a screw (Chasles): only a long one is evidence for a thread. A shorter one is
 no type among the others; it stands for a body that moves freely, if it is clearly more probable than they are."""
+VOTERS = 0.15
+"""Edge of a neighbourhood that has a vote on the type, over the link's diagonal."""
+NEAR, HELD = 4.0, 30.0
+"""A hinge is as near as hinges are if the logarithm of its radius is within two standard deviations of the prior; and
+how much more than it is worth the prior counts to get there."""
+APART_DEG = 8.0
+"""Axes so far from each other are two optima, not one."""
 NO_SCREW = 1e-3
 """A thread less probable than this in the first round is not looked at again: the hinge is its special case."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another axis of the same type that explains the motion too: how far off it is, and its probability."""
+
+    apart_deg: float
+    probability: float
 
 
 @dataclass(frozen=True)
@@ -59,6 +78,7 @@ class Finished:
         sight: its observations, (n, T).  members: (n,) indices into the tracks given.
         spread: its uncertainty.  probability: of each type.
         view: focal length and camera, whose path is fitted together with the joint where it moves.
+        rival: the most probable of the other axes that were among the starts.
     """
 
     bundle: Bundle
@@ -67,6 +87,7 @@ class Finished:
     spread: Spread
     probability: dict[str, float]
     view: View
+    rival: Rival | None = None
 
 
 @dataclass(frozen=True)
@@ -105,22 +126,8 @@ def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
     if s.kind == "prismatic":
         q = q / unit
     point = s.point / unit
-    twist, speed = twist_of_joint(s.kind, s.axis, point, _anchor(s.kind, X, s.axis, point))
+    twist, speed = twist_of_joint(s.kind, s.axis, point, anchor_of(s.kind, X, s.axis, point))
     return Bundle(s.kind, twist, q * speed, X)
-
-
-def _anchor(kind: str, X: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """The link's middle, or beside it where the axis goes through the middle (a knob)."""
-    middle = np.median(X, axis=0)
-    if kind == "prismatic":
-        return middle
-    across = (X - point) - np.outer((X - point) @ axis, axis)
-    radius = float(np.sqrt(np.median(np.sum(across**2, axis=1))))
-    out = np.median(across, axis=0)
-    if np.linalg.norm(out) < 0.3 * radius:
-        far = across[np.argmax(np.linalg.norm(across, axis=1))]
-        return middle - out + far * radius / np.linalg.norm(far)
-    return middle
 
 
 @dataclass(frozen=True)
@@ -181,13 +188,15 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
     sight = view.sightings(uv[ids[pick]], some, lasting=100.0)
     best: dict[str, Bundle] = {}
+    others: dict[str, list[Bundle]] = {}
     for kind, several in starts.items():
         tried = []
         for start in several:
             b = start if isinstance(start, Bundle) else bundle_of_state(*start, some)
             q = b.q[some] if len(b.q) > len(some) else b.q
             tried.append(polish(replace(b, X=b.X[pick], q=q - q[0]), sight))
-        best[kind] = min(tried, key=lambda b: b.cost)
+        best[kind] = min(tried, key=lambda b: b.cost + radius_cost(b, sight))
+        others[kind] = [b for b in tried if b is not best[kind]]
     # Tracks that make sense as points of one link, by every type if these are nearly all of them.
     sane = [compact(b.X) & (b.X[:, 2] > 0) for b in best.values()]
     keep = np.logical_and.reduce(sane)
@@ -228,9 +237,15 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
         best, few = _together(best, few, uv, rest, view)
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
-    probability = type_probabilities(best, few)
+    near: list[Bundle] = []
+    if still is None and _winner(type_probabilities(best, few)) == "prismatic":
+        hinge = best["revolute"]
+        every = [hinge, polish(hinge, few, hold=HELD), *(_refitted(b, hinge, few) for b in others.get("revolute", []))]
+        near = [b for b in every if radius_cost(b, few) < NEAR * b.sigma**2 * few.lasting and turn_deg(b) < 360]
+    probability = type_probabilities(best, few, near)
     last = best[_winner(probability)]
     sure = spread(last, few)
+    rival = _rival(last, others.get(last.kind, []), few) if still is None else None
     weight = few.weight
     if few.link is not None:
         view = view.corrected(last, some)
@@ -242,7 +257,7 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     if len(some) < T:
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
-    return Finished(b, every, members, sure, probability, view)
+    return Finished(b, every, members, sure, probability, view, rival)
 
 
 def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sightings:
@@ -390,29 +405,91 @@ def _across_kinds(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bundle
         for e in (*basis, *-basis):
             bent = replace(slide_b.twist, curvature=0.3 / size * e)
             out.setdefault("revolute", []).append(replace(slide_b, kind="revolute", twist=bent))
-    return {kind: min((polish(b, sight) for b in starts), key=lambda b: b.cost) for kind, starts in out.items()}
+    return {
+        kind: min((polish(b, sight) for b in starts), key=lambda b: b.cost + radius_cost(b, sight))
+        for kind, starts in out.items()
+    }
 
 
-def type_probabilities(best: dict[str, Bundle], sight: Sightings) -> dict[str, float]:
-    """Posterior of the types, from the curvature of the hinge and the advance of the screw."""
-    hinge = best["revolute"]
+def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence[Bundle] = ()) -> dict[str, float]:
+    """Posterior of the types, from the curvature of the hinge and the advance of the screw.
+
+    Args:
+        best: of every type.  sight: its observations.
+        near: hinges as near as hinges are. The best hinge of all may be a slide that strays have bent, so that a slide
+            which wins has to win the votes against these.
+    """
+    hinge, slide = best["revolute"], best["prismatic"]
     size = float(np.linalg.norm(np.quantile(hinge.X, 0.95, axis=0) - np.quantile(hinge.X, 0.05, axis=0)))
-
-    def gain(one: Bundle, other: Bundle) -> float:
-        """Log-likelihood ratio where the noise's size is unknown: so many observations times half the logarithm."""
-        count = one.cost / (2 * one.sigma**2 * sight.lasting)
-        return float(count * np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
-
     curvature = spread(hinge, sight).curvature
-    odds = log_odds_hinge(hinge.twist, curvature, size, gain(hinge, best["prismatic"]))
-    log = {"prismatic": 0.0, "revolute": odds}
     if "screw" in best:
+        # A body that is carried freely refutes both types together: no vote between them is asked for.
         screw = best["screw"]
-        log["screw"] = odds + log_odds_screw(screw.twist, spread(screw, sight).curvature, gain(screw, hinge))
-    p = probabilities(log)
-    if "screw" in best and turn_deg(best["screw"]) < SCREW_TURN_DEG and p["screw"] < FREE_BODY:
-        p = probabilities({kind: value for kind, value in log.items() if kind != "screw"})
-    return p
+        odds = log_odds_hinge(hinge.twist, curvature, size, _cost_gain(hinge, slide, sight))
+        more = log_odds_screw(screw.twist, spread(screw, sight).curvature, _cost_gain(screw, hinge, sight))
+        p = probabilities({"prismatic": 0.0, "revolute": odds, "screw": odds + more})
+        if turn_deg(screw) >= SCREW_TURN_DEG or p["screw"] >= FREE_BODY:
+            return p
+    odds = log_odds_hinge(hinge.twist, curvature, size, _gain(hinge, slide, sight))
+    if odds > 0:
+        odds = tempered(odds, _votes(hinge, slide, sight))
+    elif near:
+        odds = tempered(odds, -min(_votes(slide, b, sight) for b in near))
+    return probabilities({"prismatic": 0.0, "revolute": odds})
+
+
+def _cost_gain(one: Bundle, other: Bundle, sight: Sightings) -> float:
+    """Log-likelihood ratio at the costs of the adjustment, where the noise's size is unknown."""
+    return one.cost / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
+
+
+def _costs(one: Bundle, other: Bundle, sight: Sightings) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) robust cost of every track under either, by one scale. A point out of all proportion explains nothing."""
+    limit = ROBUST_SIGMAS * max(min(one.sigma, other.sigma), 0.05)
+    out = []
+    for b in (one, other):
+        cost = track_costs(residuals(b, sight), sight, limit)
+        if sight.link is None:
+            cost = np.where(compact(b.X) & (b.X[:, 2] > 0), cost, limit**2 * sight.weight * sight.seen.sum(1))
+        out.append(cost)
+    return out[0], out[1]
+
+
+def _votes(one: Bundle, other: Bundle, sight: Sightings) -> float:
+    return votes(*_costs(one, other, sight), clusters(one, sight.link, VOTERS))
+
+
+def _gain(one: Bundle, other: Bundle, sight: Sightings) -> float:
+    """Log-likelihood ratio where the noise's size is unknown: so many observations times half the logarithm."""
+    a, b = (float(c.sum()) for c in _costs(one, other, sight))
+    return a / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(b, 1e-9) / max(a, 1e-9)))
+
+
+def _refitted(b: Bundle, like: Bundle, sight: Sightings) -> Bundle:
+    """The joint with the points of another's tracks."""
+    points = np.tile(np.median(b.X, axis=0), (len(like.X), 1))
+    return polish(place_points(replace(b, X=points), sight), sight, iterations=30)
+
+
+def _rival(last: Bundle, others: Sequence[Bundle], sight: Sightings) -> Rival | None:
+    """The most probable other axis, each fitted to the answer's own tracks.
+
+    A small motion is seen nearly as from afar, and from there a body and its mirror image that turns the other way look
+    the same (Necker's reversal): what is stated of one optimum knows nothing of the next.
+    """
+    found: list[Rival] = []
+    for b in others:
+        if _apart_deg(b, last) < APART_DEG:
+            continue
+        fitted = _refitted(b, last, sight)
+        if (apart := _apart_deg(fitted, last)) > APART_DEG:
+            odds = tempered(_gain(last, fitted, sight), _votes(last, fitted, sight))
+            found.append(Rival(apart, float(expit(-odds))))
+    return max(found, key=lambda r: r.probability, default=None)
+
+
+def _apart_deg(one: Bundle, other: Bundle) -> float:
+    return float(np.degrees(np.arccos(np.clip(abs(one.twist.axis @ other.twist.axis), 0, 1))))
 
 
 def turn_deg(b: Bundle) -> float:

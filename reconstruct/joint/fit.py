@@ -11,12 +11,21 @@ from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import bridged, free_motion, looser
-from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Still, View, finish, turn_deg
+from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Starts, Still, View, bundle_of_state, finish, turn_deg
 from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import positions, residuals
-from reconstruct.joint.select import distinct, explained, key_frames, motion_stretches, observations, search
+from reconstruct.joint.select import (
+    distinct,
+    explained,
+    global_profile,
+    key_frames,
+    motion_stretches,
+    observations,
+    search,
+)
+from reconstruct.joint.sweep import SMALL, sweep
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 
@@ -33,6 +42,8 @@ what points at rest leave their place: a stabilised hand-held camera moves every
 DEPTHS = 0.68
 """What the compensation of a moving camera leaves depends on the depth, and the link's own is not known: it is taken to
 be what this share of the resting points stays under, one standard deviation."""
+LIKELY = 0.1
+"""Probability of another axis, or type, from which on the answer is not called certain."""
 VAGUE_DEG = 10.0
 """Standard deviation of an axis beyond which the joint is not called certain."""
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
@@ -42,10 +53,10 @@ PRIOR_STD = 0.12
 """Prior standard deviation of its logarithm."""
 KNOWN_STD = 0.02
 """Standard deviation that is stated for a focal length that was given."""
-FREE_SHARE = 1 / 3
+FREE_SHARE = 1 / 4
 """A joint is refuted if this share of the points that move most follow a free rigid body but not the joint. Real hinges
-and slides, with flexing parts, drifting tracks and an imperfect camera, stay under a fifth; a lid that is lifted away
-leaves more than half."""
+and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0 to 0.15; what is lifted away leaves
+0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
 
 
 def fit_joint(
@@ -102,7 +113,8 @@ def fit_joint(
 
     if video.warp is None:
         restless = _restlessness(uv, camera, 0.5)
-        done = finish(found.starts, uv - camera.centre, found.members, view)
+        starts, members = _sharpened(found, uv - camera.centre, view, camera)
+        done = finish(starts, uv - camera.centre, members, view)
     else:
         done, restless, words = _hand_held(found, uv, video.warp, view, camera)
         note += words
@@ -110,6 +122,19 @@ def fit_joint(
     if reason := _why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
+
+
+def _sharpened(found: _Consensus, uv: np.ndarray, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:
+    """Starts and tracks for the end: the search's own, or where the motion is small those of a sweep.
+
+    Args:
+        uv: (N, T, 2) px from the principal point.
+    """
+    if found.obs is None or np.ptp(global_profile(found.obs)) / found.obs.px > SMALL * camera.diagonal:
+        return found.starts, found.members
+    rivals = [bundle_of_state(*s, found.obs.frames) for several in found.starts.values() for s in several]
+    swept = sweep(uv, found.moving, found.obs, found.members, rivals, view)
+    return (found.starts, found.members) if swept is None else (swept.starts, swept.ids)
 
 
 def _hand_held(found: _Consensus, uv: np.ndarray, warp: np.ndarray, view: View, camera: _Camera
@@ -154,6 +179,7 @@ class _Consensus:
         members: (n,) indices of these tracks.
         explained: motion of all tracks that it explains.
         refusal: a sentence, or "".  scattered: True if too few tracks agree on anything.
+        obs: what was searched.  moving: (m,) indices of the tracks that leave their place.
     """
 
     starts: dict[str, list[tuple[State, Observations]]] = field(default_factory=dict)
@@ -161,6 +187,8 @@ class _Consensus:
     explained: float = 0.0
     refusal: str = ""
     scattered: bool = False
+    obs: Observations | None = None
+    moving: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
 def _moving(uv: np.ndarray, diagonal: float) -> np.ndarray:
@@ -224,7 +252,7 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
             near = [h for h in ranked if h.kind == "revolute" and explained(h, obs)[0] > RIVAL * worth["revolute"]]
             starts["revolute"] += [(_redepth(h, link), link) for h in distinct(near, RIVALS)[1:]]
         found = _Consensus(starts, moving[ids[follows]], total, _why_refused(s, every, follows) or "",
-                           bool(follows.sum() < MIN_INLIERS))  # fmt: skip
+                           bool(follows.sum() < MIN_INLIERS), obs, moving)  # fmt: skip
         if not found.refusal:
             return found
         first = first or found
@@ -334,7 +362,7 @@ def _result(
     K = np.array([[full_focal, 0, (video.size[0] - 1) / 2], [0, full_focal, (video.size[1] - 1) / 2], [0, 0, 1.0]])
     p = max(probability.values())
     verdict, reason = "ok", f"{len(done.members)} tracks agree; {how}{note}"
-    if p < 0.9:
+    if p < 1 - LIKELY:
         verdict = "ambiguous"
         names = " and ".join(sorted(probability, key=probability.get, reverse=True))
         reason = (
@@ -347,7 +375,16 @@ def _result(
             f"{len(done.members)} tracks hold the axis to {sure.axis_deg:.0f} deg only; a longer motion, or more of "
             f"the part in view, would tell; {how}{note}"
         )
-    std = {"axis_deg": sure.axis_deg, "point_m": sure.point, "q": sure.q,
+    rival, axis_deg = done.rival, sure.axis_deg
+    if rival is not None:
+        axis_deg = float(np.hypot(axis_deg, np.sqrt(rival.probability) * rival.apart_deg))
+    if verdict == "ok" and rival is not None and rival.probability > LIKELY:
+        verdict = "ambiguous"
+        reason = (
+            f"another axis, {rival.apart_deg:.0f} deg off, explains the motion almost equally well "
+            f"(p = {rival.probability:.2f}); a longer motion would tell; {how}{note}"
+        )
+    std = {"axis_deg": axis_deg, "point_m": sure.point, "q": sure.q,
            "focal_px": full_focal * (sure.log_focal if focal_std is None else focal_std)}  # fmt: skip
     fit = JointFit(
         verdict,

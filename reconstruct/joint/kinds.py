@@ -9,14 +9,12 @@ direction of motion.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import log_ndtr
 
+from reconstruct.joint.polish import HINGE_RADIUS, HINGE_SPREAD
 from reconstruct.joint.twist import Twist
 
 PRIOR = {"revolute": 0.6, "prismatic": 0.37, "screw": 0.03}
-HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.5
-"""Median distance of a hinge from the link's middle over the link's size, and the standard deviation of its logarithm.
-The hinges of simulated furniture lie 0.34 to 0.64 link diagonals away (knobs less); texture on a part of the link only
-makes it look smaller."""
 
 
 def log_odds_hinge(twist: Twist, covariance: np.ndarray, size: float, gain: float) -> float:
@@ -70,6 +68,31 @@ def log_odds_screw(twist: Twist, covariance: np.ndarray, gain: float) -> float:
     log = np.concatenate([-0.5 * ((x - share) / std) ** 2, -0.5 * ((x + share) / std) ** 2])
     top = log.max()
     return float(top + np.log(np.exp(log - top).mean()) + gain)
+
+
+def votes(for_one: np.ndarray, for_other: np.ndarray, cluster: np.ndarray) -> float:
+    """By how many standard deviations the neighbourhoods of the link prefer one joint to another (Vuong, 1989).
+
+    Args:
+        for_one, for_other: (N,) cost of every track under either.  cluster: (N,) its neighbourhood.
+
+    Returns:
+        Positive for the first; 0 where there are too few neighbourhoods to vote.
+    """
+    by = np.bincount(cluster, for_other - for_one)
+    n = len(by)
+    spread = float(np.sqrt(n * np.var(by, ddof=1))) if n > 2 else 0.0
+    return float(by.sum()) / spread if spread > 0 else 0.0
+
+
+def tempered(odds: float, z: float) -> float:
+    """Log odds no surer than the votes `z` for the side that they favour.
+
+    A likelihood believes that all tracks are of one body with independent errors. Where strays are among them a part of
+    the tracks decides against the rest, by any number of nats; by how far the neighbourhoods agree does not grow so.
+    """
+    z = np.sign(odds) * z
+    return float(np.sign(odds) * min(abs(odds), max(log_ndtr(z) - log_ndtr(-z), 0.0)))
 
 
 def probabilities(log_odds: dict[str, float]) -> dict[str, float]:

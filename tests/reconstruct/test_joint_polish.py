@@ -9,8 +9,19 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.finish import compact, type_probabilities
+from reconstruct.joint.kinds import tempered, votes
 from reconstruct.joint.models import joint_transform
-from reconstruct.joint.polish import Bundle, Sightings, normal_equations, place_points, polish, positions, residuals
+from reconstruct.joint.polish import (
+    Bundle,
+    Sightings,
+    normal_equations,
+    place_points,
+    polish,
+    positions,
+    radius_cost,
+    regauged,
+    residuals,
+)
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import lasting_error, shared_error, spread, strayed
 
@@ -160,3 +171,51 @@ def test_points_find_their_place_and_strays_are_told_apart():
     assert np.median(np.linalg.norm(found.X - truth.X, axis=1)) < 0.02
     X = np.concatenate([truth.X, truth.X[:3] * 4])
     assert compact(X).tolist() == [True] * len(truth.X) + [False] * 3
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_start_far_from_its_scale_and_anchor_arrives_as_well(kind):
+    """Nothing holds the scale before a resting camera: a link that has gone to a fiftieth of its anchor's depth."""
+    truth, s = scene(kind, stroke=0.2)
+    near = replace(truth, X=truth.X / 50, q=truth.q / 50,
+                   twist=Twist(truth.twist.anchor / 50, truth.twist.direction, 50 * truth.twist.curvature))  # fmt: skip
+    moved = np.array([0.0, 0.0, 1.0])
+    velocity = near.twist.direction + np.cross(near.twist.curvature, moved - near.twist.anchor)
+    speed = np.linalg.norm(velocity)
+    odd = replace(near, q=near.q * speed, twist=Twist(moved, velocity / speed, near.twist.curvature / speed))
+    same = regauged(odd, s)
+    np.testing.assert_allclose(residuals(same, s), residuals(truth, s), atol=1e-6)
+    assert abs(np.median(same.X[:, 2]) - 1) < 1e-9
+    assert np.linalg.norm(same.twist.anchor - np.median(same.X, axis=0)) < np.linalg.norm(np.ptp(same.X, axis=0))
+    assert regauged(same, s) is same
+    assert polish(odd, s).cost == pytest.approx(polish(truth, s).cost, rel=1e-3)
+
+
+def test_neighbourhoods_that_disagree_temper_a_likelihood():
+    """What some tracks shout against what the others say is not certain, whatever the likelihood."""
+    cluster = np.repeat(np.arange(20), 5)
+    rng = np.random.default_rng(0)
+    even = rng.uniform(1, 2, 100)
+    agreed = votes(even, even + 0.5 + 0.1 * rng.random(100), cluster)
+    split = votes(even, even + np.where(cluster < 8, 10.0, -6.0), cluster)
+    assert agreed > 6 and abs(split) < 1
+    assert votes(even + 0.5 + 0.1 * rng.random(100), even, cluster) < -6
+    assert votes(even[:10], even[:10] + 1, cluster[:10]) == 0.0  # two neighbourhoods are no vote
+    assert tempered(50.0, agreed) > 20 and tempered(-50.0, -agreed) < -20
+    assert 0 <= tempered(50.0, split) < 2
+    assert tempered(50.0, -3.0) == 0.0 and tempered(2.0, agreed) == 2.0
+
+
+def test_a_hinge_is_no_nearer_or_farther_than_hinges_are_where_the_pictures_do_not_say():
+    """A hinge that turns by two degrees at the noise of tracks: its prior decides, and lets go elsewhere."""
+    truth, s = scene("revolute", stroke=0.03, noise=0.5)
+    size = np.linalg.norm(np.quantile(truth.X, 0.95, axis=0) - np.quantile(truth.X, 0.05, axis=0))
+    lasting = replace(s, lasting=40.0)
+    far = replace(truth, twist=replace(truth.twist, curvature=0.02 * truth.twist.curvature))
+    held = polish(place_points(far, lasting), lasting, iterations=40, hold=30.0)
+    radius = 1 / np.linalg.norm(held.twist.curvature) / np.median(held.X[:, 2]) * np.median(truth.X[:, 2])
+    assert 0.3 < radius / size < 0.7
+    assert radius_cost(held, lasting) < radius_cost(far, lasting)
+    clear, t = scene("revolute", stroke=0.8)
+    off = [polish(clear, t, hold=h).twist.axis @ clear.twist.axis for h in (0.0, 1.0)]
+    assert abs(off[0] - off[1]) < 1e-5
