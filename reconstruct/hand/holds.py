@@ -20,7 +20,8 @@ from reconstruct.joint.models import JointFit
 
 Part = tuple[np.ndarray, np.ndarray]
 TIPS = (8, 12, 16)
-THICK, HEIGHT, POST, MARGIN = 0.008, 0.012, 0.008, 0.012  # m: bar along and across the motion, posts, beyond the tips
+THICK, POST = 0.008, 0.008  # m: bar along the motion, posts
+MARGIN = 0.012  # m by which the bar's face goes beyond the tips, to either side: their place is known to a centimetre
 CLEAR = 0.003  # m between finger tips and the surface that they reach behind the bar
 STEPS = np.arange(0.0, 0.201, 0.004)  # m towards the camera
 REACH = 0.08  # m, longest post: a hand farther off the part holds nothing of it
@@ -77,10 +78,10 @@ def assumed_handle(shape: LinkShape, fit: JointFit, sign: float, hand: np.ndarra
     # The tips press on the bar as on any face; a bar stands before the foremost one.
     ahead = float(((tips - middle) @ forward).max())
     centre = middle + (ahead + RADII[TIPS[0]] - PRESS + 0.5 * THICK) * forward
-    place = (tips - middle) @ along
-    length = float(np.ptp(place)) + 2 * (MARGIN + RADII[TIPS[0]])
-    centre = centre + 0.5 * float(place.max() + place.min()) * along
-    parts = [_hull(_box(centre, axes, (THICK, length, HEIGHT)))]
+    place = (tips - middle) @ axes[1:].T
+    length, height = np.ptp(place, axis=0) + 2 * MARGIN + np.array([2 * RADII[TIPS[0]], 0.0])
+    centre = centre + 0.5 * (place.max(0) + place.min(0)) @ axes[1:]
+    parts = [_hull(_box(centre, axes, (THICK, length, height)))]
     for side in (-1.0, 1.0):
         end = centre + side * 0.5 * (length - POST) * along
         foot = shape.points[int(np.linalg.norm(shape.points - end, axis=1).argmin())]

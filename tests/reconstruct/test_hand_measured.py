@@ -11,11 +11,11 @@ from scipy.ndimage import gaussian_filter1d
 from reconstruct.cues import Hands
 from reconstruct.geometry import Geometry
 from reconstruct.hand.align import align_hand
-from reconstruct.hand.grip import RADII, SPHERES, Grip, Sighting
+from reconstruct.hand.grip import RADII, SPHERES, Grip, Sighting, pushing_spheres
 from reconstruct.hand.holds import assumed_handle, holding
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.scale import hand_scale, rescale
-from reconstruct.hand.shape import LinkShape
+from reconstruct.hand.shape import LinkShape, drive_direction
 from taa_envs.authoring import save_asset
 from taa_envs.replay import replay
 from tests.reconstruct.hand_scenes import Scene, make_scene
@@ -108,6 +108,21 @@ def test_no_handle_is_assumed_far_from_the_part() -> None:
     assert assumed_handle(shape, scene.fit, 1.0, grip, ray) is not None
     assert assumed_handle(shape, scene.fit, 1.0, grip + [0.0, -0.2, 0.0], ray) is None
     assert assumed_handle(shape, scene.fit, 1.0, grip + 0.4 * ray, ray) is None  # would have to come 40 cm nearer
+
+
+def test_an_assumed_handle_holds_a_hand_that_is_a_centimetre_off() -> None:
+    """The tips' place is known no better; on a bar as narrow as that the replay was a matter of luck."""
+    scene = make_scene("drawer")
+    shape, grip, ray = gripping(scene)
+    parts, moved = assumed_handle(shape, scene.fit, 1.0, grip, ray)
+    bar = shape.with_parts(parts[:1])
+    forward = drive_direction(scene.fit, moved[8], 1.0)
+    on = pushing_spheres(bar, scene.fit, 1.0, moved)[[8, 12, 16]]
+    assert on.any()
+    for across in np.linalg.svd(forward[None])[2][1:]:
+        for shift in (-0.01, 0.01):
+            still = pushing_spheres(bar, scene.fit, 1.0, moved + shift * across)[[8, 12, 16]]
+            assert still[on].all(), (across, shift)
 
 
 def test_a_hand_sunk_into_the_surface_comes_towards_the_camera_before_a_handle_is_put_there() -> None:
