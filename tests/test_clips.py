@@ -1,4 +1,7 @@
-"""The whole chain on whole videos: rendered ones always, real ones where they are present."""
+"""The whole chain on whole videos: rendered ones always, real ones where they are present.
+
+The demo clip's is in reconstruct/test_pipeline.py.
+"""
 
 import numpy as np
 import pytest
@@ -45,27 +48,6 @@ def test_a_door_that_springs_open_is_not_driven_by_contact(name, tmp_path):
     assert row["angle_deg"] < 8 and row["distance"] < 0.04
     assert row["replay"]["joint_progress"] < 0.1
     assert row["replay"]["contact_fraction"] == 0
-
-
-def test_demo_clip_from_its_pixels_alone(tmp_path):
-    row = run("demo", tmp_path)
-    assert (row["verdict"], row["type"]) == ("ok", "revolute")
-    assert row["angle_deg"] < 2
-    assert row["distance"] < 0.02
-    assert row["replay"]["joint_progress"] >= 0.9
-    assert max(row["replay"]["controls"].values()) < 0.1
-    # The same asset as a user gets it.
-    import gymnasium
-
-    from taa_envs.registry import register_assets
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TAA_ASSETS", str(tmp_path / "assets"))
-        register_assets()
-        env = gymnasium.make("TAA/clip-demo")
-        observation, info = env.reset(seed=0)
-        assert np.isfinite(observation).all()
-        env.close()
 
 
 @pytest.mark.parametrize("name", ["still", "lift"])

@@ -52,6 +52,8 @@ SCREW_TURN_DEG, FREE_BODY = 120.0, 0.95
 no type among the others; it stands for a body that moves freely, if it is clearly more probable than they are."""
 VOTERS = 0.15
 """Edge of a neighbourhood that has a vote on the type, over the link's diagonal."""
+UNDECIDED = 1.0
+"""Log odds that are left where points out of all proportion to the link would turn the answer round."""
 NEAR, HELD = 4.0, 30.0
 """A hinge is as near as hinges are if the logarithm of its radius is within two standard deviations of the prior; and
 how much more than it is worth the prior counts to get there."""
@@ -423,14 +425,20 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
     size = float(np.linalg.norm(np.quantile(hinge.X, 0.95, axis=0) - np.quantile(hinge.X, 0.05, axis=0)))
     curvature = spread(hinge, sight).curvature
     if "screw" in best:
-        # A body that is carried freely refutes both types together: no vote between them is asked for.
+        # A body that is carried freely refutes both types together: no vote between them is asked for, but that every
+        # neighbourhood is carried so, not strays alone.
         screw = best["screw"]
         odds = log_odds_hinge(hinge.twist, curvature, size, _cost_gain(hinge, slide, sight))
         more = log_odds_screw(screw.twist, spread(screw, sight).curvature, _cost_gain(screw, hinge, sight))
+        if more > 0:
+            more = tempered(more, _votes(screw, hinge, sight))
         p = probabilities({"prismatic": 0.0, "revolute": odds, "screw": odds + more})
         if turn_deg(screw) >= SCREW_TURN_DEG or p["screw"] >= FREE_BODY:
             return p
     odds = log_odds_hinge(hinge.twist, curvature, size, _gain(hinge, slide, sight))
+    if odds * log_odds_hinge(hinge.twist, curvature, size, _cost_gain(hinge, slide, sight)) < 0:
+        # Points that are no part of a link of any shape would turn the answer round: they are as likely to know.
+        return probabilities({"prismatic": 0.0, "revolute": float(np.clip(odds, -UNDECIDED, UNDECIDED))})
     if odds > 0:
         odds = tempered(odds, _votes(hinge, slide, sight))
     elif near:

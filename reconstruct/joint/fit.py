@@ -36,7 +36,7 @@ SIMPLER = 1.05
 RIVAL, RIVALS = 0.9, 4
 """Hinges that explain this share of what the best one does are polished too, so many at most."""
 BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
-LOOSER, RESTLESS = 4.0, 3.0
+LOOSER, RESTLESS = 2.75, 3.0
 """A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
 what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
 DEPTHS = 0.68
@@ -328,7 +328,7 @@ def _why_not_believed(done: Finished, restlessness: float = np.inf) -> str | Non
     times = looser(done.bundle, done.sight) if misses else None
     if times is not None and times > LOOSER:
         return (
-            f"the part moves as a free body: its points follow one {times:.0f} times more exactly than the best joint "
+            f"the part moves as a free body: its points follow one {times:.2g} times more exactly than the best joint "
             f"({done.bundle.kind})"
         )
     return None
