@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.finish import compact, type_probabilities
+from reconstruct.joint.finish import FREE_BODY, compact, type_probabilities
 from reconstruct.joint.kinds import tempered, votes
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.polish import (
@@ -150,6 +150,30 @@ def test_type_from_one_family(kind):
     p = type_probabilities(best, s)
     assert p[kind] > 0.9
     assert sum(p.values()) == pytest.approx(1)
+
+
+def carried(share, seed=3):
+    """Every type's best for a small hinge of which the tracks at one end are carried along its axis too."""
+    truth, s = scene("revolute", seed, stroke=0.25)
+    aside = truth.X @ truth.twist.axis
+    lifted = aside >= np.quantile(aside, 1 - share)
+    moved = replace(truth, kind="screw", twist=replace(truth.twist, direction=truth.twist.direction
+                                                       + 0.2 * truth.twist.axis))  # fmt: skip
+    uv = np.where(lifted[:, None, None], s.uv + residuals(moved, s) - residuals(truth, s), s.uv)
+    s = replace(s, uv=uv)
+    slide = replace(truth, kind="prismatic", twist=truth.twist.moved(np.zeros(6), "prismatic"))
+    starts = {"revolute": [truth], "prismatic": [slide], "screw": [truth, moved]}
+    tried = {k: [polish(replace(b, kind=k), s, iterations=40) for b in several] for k, several in starts.items()}
+    return {k: min(several, key=lambda b: b.cost) for k, several in tried.items()}, s
+
+
+def test_a_part_of_the_tracks_does_not_make_a_free_body():
+    best, s = carried(0.2)
+    gain = best["revolute"].cost - best["screw"].cost
+    assert gain / (2 * best["screw"].sigma ** 2) > 20  # by its likelihood alone it would be one
+    assert type_probabilities(best, s).get("screw", 0.0) < FREE_BODY
+    best, s = carried(1.0)
+    assert type_probabilities(best, s)["screw"] > FREE_BODY
 
 
 def test_lasting_and_shared_errors_are_measured():
