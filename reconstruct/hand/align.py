@@ -210,6 +210,8 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
         factor, spread = depth_factor(fit, shape, seen.camera, use)
         notes.append(f"hand depth times {factor:.2f} puts it at the part; it then stays within {1e3 * spread:.0f} mm "
                      f"in the part's frame while it drives it")
+    if drive.beyond:
+        notes.append("no hand moves as the part's surface does: this one's fingers move as it would beyond its edge")
     world = _to_world(fit, seen.camera * factor)
     pose = fit.link_pose(fit.q)
     carried = _carried(drive, hand.valid, moving, rate)

@@ -29,12 +29,15 @@ class Drive:
         near: (T,) bool, the hand is seen at the part.
         drives: (T,) bool, it is seen to drive it.
         attached: (T,) bool, it is at the part and moves (or rests) with it; short gaps are closed.
+        beyond: no hand moves as the part's surface does, and this one's fingers as it would beyond its edge: weaker
+            evidence.
     """
 
     index: int | None
     near: np.ndarray
     drives: np.ndarray
     attached: np.ndarray
+    beyond: bool = False
 
 
 def moving_frames(fit: JointFit, time: np.ndarray) -> np.ndarray:
@@ -212,4 +215,4 @@ def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarra
         if not (seen & ~near[a:b]).any() and (near[a:b].sum() >= 0.8 * seen.sum()):
             attached[a:b] = True
     attached = _rest(attached, moving, near, hands.tracks[index])
-    return Drive(index, near, drives, attached)
+    return Drive(index, near, drives, attached, beyond)

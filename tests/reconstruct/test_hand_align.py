@@ -14,7 +14,7 @@ from reconstruct.hand.drive import close_gaps, find_drive, runs
 from reconstruct.hand.grip import penetration
 from reconstruct.hand.pnp import hand_positions
 from reconstruct.hand.scale import hand_scale, rescale
-from reconstruct.hand.shape import LinkShape
+from reconstruct.hand.shape import LinkShape, lever
 from reconstruct.hand.skeleton import ADULT, HAND_SIZE_STD, PALM, bone_lengths, one_anatomy, reach
 from taa_envs.authoring import save_asset
 from taa_envs.replay import replay
@@ -56,6 +56,16 @@ def test_a_monocular_hand_becomes_one_that_drives_the_part(name: str, seed: int,
     # No jumps: a person's hand stays below 3 m/s.
     speed = np.linalg.norm(np.diff(reference.hand_joints, axis=0), axis=-1).max() * 30
     assert speed < 3.0
+
+
+def test_it_is_told_when_only_fingers_beyond_the_edge_say_who_drives() -> None:
+    scene = make_scene("oven")
+    points = LinkShape(scene.geometry.moving).points
+    arm = lever(scene.fit, points)
+    whole = find_drive(scene.hands, scene.fit, scene.video.time, points)
+    part = find_drive(scene.hands, scene.fit, scene.video.time, points[arm < 0.5 * arm.max()])
+    assert (whole.index, whole.beyond) == (0, False)
+    assert (part.index, part.beyond) == (0, True)
 
 
 @given(st.integers(0, 1000), st.floats(-0.5, 0.5), st.floats(0.8, 1.2))
