@@ -13,7 +13,7 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 AT_FDCWD, NOREPLACE, EXCHANGE = -100, 1, 2
@@ -130,6 +130,11 @@ def _sweep(folder: Path, name: str) -> None:
 
 
 def _alive(number: int) -> bool:
+    """Whether a process has that id and has not ended; one that nobody waited for keeps its id, in some containers for
+    ever."""
+    with suppress(OSError, IndexError):
+        if Path(f"/proc/{number}/stat").read_text(errors="replace").rpartition(")")[2].split()[0] in "ZX":
+            return False
     try:
         os.kill(number, 0)
     except ProcessLookupError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.faults import JOBS, door_arguments, killed, remains
+from benchmarks.faults import JOBS, door_arguments, fork, killed, remains
 from taa_envs import files
 from taa_envs.asset import save_asset
 from taa_envs.files import folder_written_whole, written_whole
@@ -58,6 +59,25 @@ def test_what_a_killed_writer_left_goes_with_the_next_write(tmp_path: Path) -> N
     with folder_written_whole(tmp_path / "thing", True) as work:
         (work / "new").write_text("new")
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["new", "note.txt", "thing"]
+
+
+def test_a_writer_that_ended_and_that_nobody_waited_for_is_dead(tmp_path: Path) -> None:
+    """Its id stays taken, as where the first process of a container does not wait for orphans."""
+
+    def begin() -> None:
+        with folder_written_whole(tmp_path / "thing") as work:
+            (work / "half").write_text("x")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    child = fork(begin)
+    try:
+        os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+        assert len(remains(tmp_path)) == 1
+        with folder_written_whole(tmp_path / "thing") as work:
+            (work / "new").write_text("new")
+        assert sorted(p.name for p in tmp_path.rglob("*")) == ["new", "thing"]
+    finally:
+        os.waitpid(child, 0)
 
 
 def test_what_a_living_writer_writes_is_left_alone(tmp_path: Path) -> None:
