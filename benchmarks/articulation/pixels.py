@@ -23,6 +23,11 @@ FRAMES = 48
 DIAGONAL = 0.55
 """m, of the rendered object: everything is brought to a size that a hand can hold."""
 STRAY_PX = 3.0
+APPROACHES = (0, 40, -40, 80, -80, 120, -120, 160, -160)
+"""deg in the picture, of the direction that the hand comes from against that from below: the first that is free."""
+FLESH = 0.01
+"""m, that skin and sleeve give way."""
+PALM_JOINTS = (0, 1, 2, 5, 6, 9, 10, 13, 14, 17, 18)
 
 
 def film(model: Model, motion: str, texture: str, small: bool = False, seed: int = 0, frames: int = FRAMES) -> Given:
@@ -86,7 +91,7 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
 
     from reconstruct.synth import textures as tx
     from reconstruct.synth.animation import Motion
-    from reconstruct.synth.hand_model import HandPose, landmarks
+    from reconstruct.synth.hand_model import HandPose
     from reconstruct.synth.objects import Box
     from reconstruct.synth.objects import Model as Shown
     from reconstruct.synth.render import render
@@ -115,21 +120,18 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
     wall = middle + 1.1 * DIAGONAL * view[:, 2]
     paper = tx.with_stickers(tx.plaster((0.80, 0.77, 0.70)), 30, 0.18)
     boxes.append(Box("room", wall + 0.05 * view[:, 2], np.array([4.0, 3.0, 0.04]), paper, view, 300.0))
-    # A hand on the link's part that moves most, from below, between the camera and the object.
+    # A hand on the link's part that moves most, between the camera and the object: from below, or from where else the
+    # arm goes through nothing.
     pose = HandPose()
     grip = _grip(model, shot, rng)
-    fingers = view @ (np.array([-0.3, -0.7, 0.5]) / np.linalg.norm([-0.3, -0.7, 0.5]))
-    palm = view[:, 2] - (view[:, 2] @ fingers) * fingers
-    palm /= np.linalg.norm(palm)
-    R = np.stack([np.cross(fingers, palm), fingers, palm], axis=1)
-    tip = landmarks(pose)[12]
     poses = model.link_pose(shot.q, q0)
-    hand = np.tile(np.eye(4), (len(shot.q), 1, 1))
-    hand[:, :3, :3] = R
-    hand[:, :3, 3] = there(poses[:, :3, :3] @ grip + poses[:, :3, 3]) - R @ tip - 0.012 * view[:, 2]
     link = np.tile(np.eye(4), (len(shot.q), 1, 1))
     link[:, :3, :3] = turn @ poses[:, :3, :3] @ turn.T
     link[:, :3, 3] = there(poses[:, :3, 3])
+    touched = there(poses[:, :3, :3] @ grip + poses[:, :3, 3])
+    held = [_hold(pose, touched, view @ Rotation.from_euler("z", a, degrees=True).as_matrix()) for a in APPROACHES]
+    clear = [_clearance(pose, T, link, boxes) for T in held]
+    hand = held[next((k for k, c in enumerate(clear) if c >= -FLESH), int(np.argmax(clear)))]
     look = np.eye(4)
     look[:3, :3], look[:3, 3] = view.T, -view.T @ eye
     shown = Shown(tuple(boxes), None, None, None, 0.0, (0.0, 0.0))
@@ -137,6 +139,44 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
     T = len(shot.q)
     motion = Motion(np.arange(T) / 24, shot.q, np.ones(T, bool), link, hand, np.tile(look, (T, 1, 1)))
     return render(clip, motion, SIZE, int(rng.integers(1 << 30))).image
+
+
+def _hold(pose, touched: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """(T, 4, 4) of a hand whose middle finger's tip stays before the points ``touched`` (T, 3).
+
+    Args:
+        view: (3, 3) columns right, down and forward of the picture, turned by the direction that it comes from.
+    """
+    from reconstruct.synth.hand_model import landmarks
+
+    fingers = view @ (np.array([-0.3, -0.7, 0.5]) / np.linalg.norm([-0.3, -0.7, 0.5]))
+    palm = view[:, 2] - (view[:, 2] @ fingers) * fingers
+    palm /= np.linalg.norm(palm)
+    R = np.stack([np.cross(fingers, palm), fingers, palm], axis=1)
+    out = np.tile(np.eye(4), (len(touched), 1, 1))
+    out[:, :3, :3] = R
+    out[:, :3, 3] = touched - R @ landmarks(pose)[12] - 0.012 * view[:, 2]
+    return out
+
+
+def _clearance(pose, hand: np.ndarray, link: np.ndarray, boxes: list) -> float:
+    """m, between the object and the palm, the fingers' first joints and the arm; negative where they go through it."""
+    from reconstruct.synth.hand_model import forearm_direction, landmarks
+
+    arm = np.linspace(0.02, pose.arm, 24)[:, None] * forearm_direction(pose)
+    points = np.concatenate([landmarks(pose)[list(PALM_JOINTS)], arm])
+    thick = np.r_[np.full(len(PALM_JOINTS), 0.008), np.full(len(arm), 0.03)]
+    least = np.inf
+    for T, moved in zip(hand[::4], link[::4], strict=True):
+        X = points @ T[:3, :3].T + T[:3, 3]
+        for box in boxes:
+            if box.link == "room":
+                continue
+            x = (X - moved[:3, 3]) @ moved[:3, :3] if box.link == "moving" else X
+            out = np.abs((x - box.centre) @ box.rotation) - np.asarray(box.size) / 2
+            away = np.linalg.norm(np.maximum(out, 0), axis=1) + np.minimum(out.max(1), 0)
+            least = min(least, float((away - thick).min()))
+    return least
 
 
 def _paint(texture: str, colour: np.ndarray):
