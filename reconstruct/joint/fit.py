@@ -58,6 +58,10 @@ FREE_SHARE = 1 / 4
 and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0 to 0.15; what is lifted away leaves
 0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
 
+TRIES = 3
+"""Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
+nothing better than that."""
+
 
 def fit_joint(
     video: Video,
@@ -89,13 +93,35 @@ def fit_joint(
     full = known or DEFAULT_FOCAL * max(video.size)
     camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
-    note = ""
     view = View(camera.focal, 0.0 if known else PRIOR_STD)
     if camera_moving or (camera_moving is None and camera_moves(uv, camera.diagonal)):
         fit = _moving_camera(video, uv - camera.centre, view, full, len(uv), seed)
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
             return fit or JointFit("refused", NO_SCENE, tracks=len(uv))
+    first: JointFit | None = None
+    for k in range(TRIES):
+        fit = _one_draw(video, uv, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
+        if fit.verdict != "refused":
+            tell(1.0)
+            return fit
+        first = first or fit
+        if fit.inliers == 0:
+            break  # this was no bad luck: there is nothing to draw from
+    assert first is not None
+    tell(1.0)
+    return first
+
+
+def _one_draw(video: Video, uv: np.ndarray, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
+              tell: Callable[[float], None]) -> JointFit:  # fmt: skip
+    """The joint before a camera that rests or is held in a hand, by one draw of hypotheses.
+
+    Args:
+        uv: (N, T, 2) working px.
+        known: focal length in full px, None where the prior's mean is taken.
+    """
+    note = ""
     found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
@@ -110,7 +136,6 @@ def fit_joint(
     if found.refusal:
         return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members))
     tell(0.9)
-
     if video.warp is None:
         restless = _restlessness(uv, camera, 0.5)
         starts, members = _sharpened(found, uv - camera.centre, view, camera)
@@ -118,9 +143,9 @@ def fit_joint(
     else:
         done, restless, words = _hand_held(found, uv, video.warp, view, camera)
         note += words
-    tell(1.0)
     if reason := _why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
+    full = camera.focal / video.scale
     return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
 
 

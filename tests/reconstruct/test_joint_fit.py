@@ -1,9 +1,12 @@
 """The joint from tracks alone: geometries, impostors, reversals, refusals, determinism."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint import fit as fit_module
 from reconstruct.joint.bundle import State, refine, solve_depths
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.fit import fit_joint
@@ -123,6 +126,27 @@ def test_free_body_is_refused_with_a_reason():
     fit = fit_joint(make_video(60), free_tracks(), focal_px=768.0)
     assert fit.verdict == "refused"
     assert "free body" in fit.reason or "no joint" in fit.reason
+
+
+def test_a_search_that_is_out_of_luck_is_drawn_again(monkeypatch):
+    """Each draw is asked for until one holds; where none does the first one's reason counts."""
+    scene, real, asked = make_scene(**SCENES["drawer"]), fit_module._consensus, []
+
+    def unlucky(times):
+        def consensus(uv, camera, rng, tell):
+            asked.append(float(rng.random()))
+            found = real(uv, camera, rng, tell)
+            return replace(found, refusal=f"draw {len(asked)}") if len(asked) <= times else found
+
+        asked.clear()
+        monkeypatch.setattr(fit_module, "_consensus", consensus)
+        return fit_joint(scene.video, scene.tracks, focal_px=768.0)
+
+    fit = unlucky(2)
+    assert fit.verdict == "ok" and axis_error_deg(fit, scene) < 1.0
+    assert len(asked) == 3 and len(set(asked)) == 3
+    fit = unlucky(9)
+    assert (fit.verdict, fit.reason, len(asked)) == ("refused", "draw 1", fit_module.TRIES)
 
 
 def test_nothing_moving_is_refused():
