@@ -61,6 +61,8 @@ and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0
 TRIES = 3
 """Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
 nothing better than that."""
+LUCKIER = 1.1
+"""What a later draw has to explain more than those before it."""
 
 
 def fit_joint(
@@ -99,13 +101,14 @@ def fit_joint(
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
             return fit or JointFit("refused", NO_SCENE, tracks=len(uv))
-    first: JointFit | None = None
+    first, most = None, 0.0
     for k in range(TRIES):
-        fit = _one_draw(video, uv, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
-        if fit.verdict != "refused":
-            tell(1.0)
-            return fit
-        first = first or fit
+        fit, worth = _one_draw(video, uv, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
+        # Asked often enough something may pass for a joint: a later draw has to explain what the others missed.
+        if fit.verdict != "refused" and worth > LUCKIER * most:
+            first = fit
+            break
+        first, most = first or fit, max(most, worth)
         if fit.inliers == 0:
             break  # this was no bad luck: there is nothing to draw from
     assert first is not None
@@ -114,8 +117,8 @@ def fit_joint(
 
 
 def _one_draw(video: Video, uv: np.ndarray, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
-              tell: Callable[[float], None]) -> JointFit:  # fmt: skip
-    """The joint before a camera that rests or is held in a hand, by one draw of hypotheses.
+              tell: Callable[[float], None]) -> tuple[JointFit, float]:  # fmt: skip
+    """The joint before a camera that rests or is held in a hand, by one draw of hypotheses, and the motion it explains.
 
     Args:
         uv: (N, T, 2) working px.
@@ -134,7 +137,7 @@ def _one_draw(video: Video, uv: np.ndarray, camera: _Camera, view: View, known: 
             found = max(tries, key=lambda t: t.explained)
             note = f"; no joint explains the whole video: the dominant of {len(stretches)} stretches of motion is taken"
     if found.refusal:
-        return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members))
+        return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members)), found.explained
     tell(0.9)
     if video.warp is None:
         restless = _restlessness(uv, camera, 0.5)
@@ -144,9 +147,9 @@ def _one_draw(video: Video, uv: np.ndarray, camera: _Camera, view: View, known: 
         done, restless, words = _hand_held(found, uv, video.warp, view, camera)
         note += words
     if reason := _why_not_believed(done, restless):
-        return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members))
+        return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members)), found.explained
     full = camera.focal / video.scale
-    return _result(video, done, full, len(uv), note, KNOWN_STD if known else None)
+    return _result(video, done, full, len(uv), note, KNOWN_STD if known else None), found.explained
 
 
 def _sharpened(found: _Consensus, uv: np.ndarray, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:

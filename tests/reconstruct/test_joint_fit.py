@@ -129,14 +129,15 @@ def test_free_body_is_refused_with_a_reason():
 
 
 def test_a_search_that_is_out_of_luck_is_drawn_again(monkeypatch):
-    """Each draw is asked for until one holds; where none does the first one's reason counts."""
+    """Each draw is asked for until one holds that explains more; where none does the first one's reason counts."""
     scene, real, asked = make_scene(**SCENES["drawer"]), fit_module._consensus, []
 
-    def unlucky(times):
+    def unlucky(times, explained=0.5):
         def consensus(uv, camera, rng, tell):
             asked.append(float(rng.random()))
             found = real(uv, camera, rng, tell)
-            return replace(found, refusal=f"draw {len(asked)}") if len(asked) <= times else found
+            less = replace(found, refusal=f"draw {len(asked)}", explained=explained * found.explained)
+            return less if len(asked) <= times else found
 
         asked.clear()
         monkeypatch.setattr(fit_module, "_consensus", consensus)
@@ -147,6 +148,8 @@ def test_a_search_that_is_out_of_luck_is_drawn_again(monkeypatch):
     assert len(asked) == 3 and len(set(asked)) == 3
     fit = unlucky(9)
     assert (fit.verdict, fit.reason, len(asked)) == ("refused", "draw 1", fit_module.TRIES)
+    fit = unlucky(1, explained=1.0)
+    assert (fit.verdict, fit.reason) == ("refused", "draw 1")
 
 
 def test_nothing_moving_is_refused():
