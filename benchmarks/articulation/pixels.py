@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -17,6 +18,9 @@ from benchmarks.articulation.motions import FOCAL, SIZE, Shot, pixel_rays, shoot
 from benchmarks.articulation.noise import Given
 from benchmarks.articulation.objects import Model
 from benchmarks.articulation.scenes import Hidden, Scene, project, rng_of
+
+if TYPE_CHECKING:
+    from reconstruct.synth.hand_model import HandPose
 
 TEXTURES = ("plain", "wood", "rich")
 FRAMES = 48
@@ -141,7 +145,7 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
     return render(clip, motion, SIZE, int(rng.integers(1 << 30))).image
 
 
-def _hold(pose, touched: np.ndarray, view: np.ndarray) -> np.ndarray:
+def _hold(pose: HandPose, touched: np.ndarray, view: np.ndarray) -> np.ndarray:
     """(T, 4, 4) of a hand whose middle finger's tip stays before the points ``touched`` (T, 3).
 
     Args:
@@ -159,7 +163,7 @@ def _hold(pose, touched: np.ndarray, view: np.ndarray) -> np.ndarray:
     return out
 
 
-def _clearance(pose, hand: np.ndarray, link: np.ndarray, boxes: list) -> float:
+def _clearance(pose: HandPose, hand: np.ndarray, link: np.ndarray, boxes: list) -> float:
     """m, between the object and the palm, the fingers' first joints and the arm; negative where they go through it."""
     from reconstruct.synth.hand_model import forearm_direction, landmarks
 

@@ -101,19 +101,19 @@ def fit_joint(
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
             return fit or JointFit("refused", NO_SCENE, tracks=len(uv))
-    first, most = None, 0.0
+    answer, most = None, 0.0
     for k in range(TRIES):
         fit, worth = _one_draw(video, uv, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
         # Asked often enough something may pass for a joint: a later draw has to explain what the others missed.
         if fit.verdict != "refused" and worth > LUCKIER * most:
-            first = fit
+            answer = fit
             break
-        first, most = first or fit, max(most, worth)
+        answer, most = answer or fit, max(most, worth)
         if fit.inliers == 0:
             break  # this was no bad luck: there is nothing to draw from
-    assert first is not None
+    assert answer is not None
     tell(1.0)
-    return first
+    return answer
 
 
 def _one_draw(video: Video, uv: np.ndarray, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
