@@ -103,6 +103,8 @@ class Evidence:
         score: (rows, cols) mean log-odds-like evidence, positive for the link; 0 unknown.
         seen: (rows, cols) number of frames that had a say.
         frames: (F,) working frames looked at.
+        shaded: (M,) share of the frames in which the background, or a shadow on it, explains all there is to see about
+            a fitted point; NaN where too few frames tell.
     """
 
     chart: Chart
@@ -110,6 +112,7 @@ class Evidence:
     score: np.ndarray
     seen: np.ndarray
     frames: np.ndarray
+    shaded: np.ndarray
 
 
 def frame_costs(video: Video, tracks: Tracks, fit: JointFit, hand_mask: np.ndarray) -> np.ndarray:
@@ -319,7 +322,7 @@ def gather(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, plane: Lin
     for _ in range(rounds):
         grown = cv2.dilate(occupied.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         covered = np.stack([warp_to_image(chart, grown, H[k], size) for k in range(len(frames))])
-        back_miss = np.stack([sample(b, k) for k, b in enumerate(background_residual(images, covered | hand))])
+        back_miss = np.stack([sample(b, k) for k, b in enumerate(background_residual(images, covered | hand, path))])
         known = usable & (back_miss >= 0) & np.isfinite(link_miss)
         ratio = np.clip((back_miss - np.where(known, link_miss, 0.0)) / (2 * noise), -3, 3)
         votes = np.where(known, weight * ratio, 0.0)
@@ -331,7 +334,35 @@ def gather(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, plane: Lin
         score = np.where(rests, np.minimum(score, -0.5), score)
         seen = np.where(rests, np.maximum(seen, 6), seen)
         occupied = _smooth(score, seen, seed, warped, usable)
-    return Evidence(chart, occupied, score, seen, frames)
+    nowhere = np.zeros(covered.shape, bool)
+    shaded = _shaded(background_residual(images, covered | hand, nowhere), hand, noise,
+                     apply_homography(S, fit.project(_carried(fit, frames))))
+    return Evidence(chart, occupied, score, seen, frames, shaded)
+
+
+def _carried(fit: JointFit, frames: np.ndarray) -> np.ndarray:
+    """(F, M, 3) the link's points in the world in some frames."""
+    pose = fit.link_pose(fit.q[frames])
+    return np.einsum("tij,nj->tni", pose[:, :3, :3], np.asarray(fit.points)) + pose[:, None, :3, 3]
+
+
+def _shaded(miss: np.ndarray, hand: np.ndarray, noise: float, uv: np.ndarray) -> np.ndarray:
+    """What :class:`Evidence` says of its ``shaded``. miss: (F, h, w), -1 unknown; uv: (F, M, 2) window px."""
+    import cv2
+
+    around = np.ones((5, 5), np.uint8)
+    h, w = miss.shape[1:]
+    px = np.nan_to_num(uv, nan=-9).round().astype(int)
+    inside = (px >= 0).all(-1) & (px[..., 0] < w) & (px[..., 1] < h)
+    px = px.clip(0, [w - 1, h - 1])
+    told, plain = np.zeros(uv.shape[:2], bool), np.zeros(uv.shape[:2], bool)
+    for k in range(len(miss)):
+        known = cv2.erode(((miss[k] >= 0) & ~hand[k]).astype(np.uint8), around) > 0
+        at = px[k, :, 1], px[k, :, 0]
+        told[k] = inside[k] & known[at]
+        plain[k] = cv2.dilate(miss[k], around)[at] < noise
+    count = told.sum(0)
+    return np.where(count >= 4, (told & plain).sum(0) / np.maximum(count, 1), np.nan)
 
 
 def contradicted(evidence: Evidence, fit: JointFit, plane: LinkPlane) -> np.ndarray:
@@ -395,12 +426,18 @@ def level_exposure(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
     return out
 
 
-def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
+SHADE, FAR_SHADE = 0.3, 0.1
+"""What a shadow's darkening counts for among the tracked points of the link and away from them."""
+
+
+def background_residual(images: np.ndarray, covered: np.ndarray, among: np.ndarray) -> np.ndarray:
     """How far each pixel is from its own colours in the frames in which nothing covers it.
 
     Args:
         images: (F, h, w, 3) from :func:`to_lab`.
         covered: (F, h, w) bool, link or hand.
+        among: (F, h, w) bool, where the link's tracked points lie: away from them a shadow is the likelier reason why
+            something grew darker.
 
     Returns:
         (F, h, w), -1 where fewer than two other frames show the background. A low quantile, since the link is
@@ -417,7 +454,8 @@ def background_residual(images: np.ndarray, covered: np.ndarray) -> np.ndarray:
         ratio = np.clip(images[k, ..., 0] / np.maximum(images[..., 0], 1.0), 0, 1)[..., None]
         hue = np.square((images[..., 1:] - 128) * ratio - (images[k, ..., 1:] - 128)).sum(-1)
         shade = (light > 0) & (light < 0.75 * images[..., 0]) & (hue < 20)
-        d = np.sqrt(np.where(shade, np.square(0.3 * light) + hue, np.square(light) + colour))
+        less = np.where(among[k], SHADE, FAR_SHADE)
+        d = np.sqrt(np.where(shade, np.square(less * light) + hue, np.square(light) + colour))
         d = np.where(free, d, np.inf)
         d[k] = np.inf
         d.sort(axis=0)

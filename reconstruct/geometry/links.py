@@ -12,9 +12,10 @@ from reconstruct.geometry.block import place_block
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, trim_parts
 from reconstruct.geometry.layers import frame_costs, spread_frames
 from reconstruct.geometry.masks import points_on_mask
-from reconstruct.geometry.outline import build_shape
+from reconstruct.geometry.outline import build_shape, trace_face
 from reconstruct.geometry.plane import fit_plane, keep_points
-from reconstruct.geometry.solids import carve, extrude, hull, swept_hulls, to_arrays
+from reconstruct.geometry.relief import find_raised
+from reconstruct.geometry.solids import carve, extrude, hull, swept_hulls, to_arrays, united
 from reconstruct.geometry.texture import paint, subdivide, vertex_normals
 from reconstruct.geometry.tray import assume_tray, with_tray
 from reconstruct.joint.models import JointFit
@@ -51,12 +52,18 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         notes.append(f"{int((~good).sum())} of {len(good)} fitted points lie off the moving silhouette; left out")
         fit, plane = keep_points(fit, plane, good)
     costs = frame_costs(video, tracks, fit, masks.hand)
-    shape = build_shape(video, hands, fit, plane, masks, costs)
-    solid = extrude(shape, plane)
+    face = trace_face(video, hands, fit, plane, masks, costs)
+    raised = find_raised(video, fit, plane, face.outline, masks, costs)
+    shape = build_shape(face, fit, plane)
+    slab = extrude(shape, plane)
+    solid = united([slab, *(piece for r in raised for piece in r.solids(plane))])
     vertices, faces = to_arrays(solid)
     extent = float(np.linalg.norm(shape.bounds[1] - shape.bounds[0]))
     clearance = CLEARANCE * extent
-    parts, convexity = convex_parts(vertices, faces)
+    parts, convexity = convex_parts(*to_arrays(slab))
+    parts = (*parts, *(part for r in raised for part in r.parts(plane)))
+    if any(r.bar for r in raised):
+        notes.append("a long thin thing on the face is taken for a bar on two posts; the gap behind it was not seen")
 
     surface, _ = subdivide(vertices, faces, 800)
     block = place_block(video, fit, plane, shape, masks, costs, surface, clearance)
@@ -112,6 +119,8 @@ def build_geometry(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, ma
         "moving_reach_to_hand": entry(shape.reach, "fitted" if shape.reach else "assumed", unit=unit),
         "moving_seen_faces": entry(float(1 - moving.assumed.mean()), "observed"),
         "moving_parts": entry(len(parts), "fitted", **{k: v for k, v in convexity.items() if k != "parts"}),
+        "moving_raised": entry([r.height for r in raised], "fitted", unit=unit, bars=[r.bar for r in raised],
+                               tracked_points=[r.points for r in raised]),
         "moving_tray_depth": entry(0.0 if tray is None else tray.depth, "assumed", unit=unit),
         "static_depth": entry(block.depth, "assumed", unit=unit),
         "static_closed_at": entry(block.end, "fitted" if block.decided else "assumed", unit=fit.unit,

@@ -9,10 +9,12 @@ from reconstruct.geometry.layers import (
     Evidence,
     background_residual,
     contradicted,
+    fill,
     frame_costs,
     gather,
     level_exposure,
     make_window,
+    seed_polygon,
     spread_frames,
     to_lab,
     warp_to_image,
@@ -23,6 +25,8 @@ from reconstruct.video import Video
 
 KEY_FRAMES = 16
 """Frames whose silhouette is cut at pixel level; the others take the nearest one's, moved with the joint."""
+SHADED = 0.7
+"""Share of the frames; a point is no link if the background or a shadow on it explains its looks in more."""
 
 
 def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> LinkMasks:
@@ -50,7 +54,12 @@ def segment_links(video: Video, hands: Hands, tracks: Tracks, fit: JointFit) -> 
     costs = frame_costs(video, tracks, fit, hands.mask)
     evidence = gather(video, hands, tracks, fit, plane, costs)
     stray = contradicted(evidence, fit, plane)
-    if 0.05 * len(stray) < stray.sum() <= len(stray) - 5:
+    if stray.sum() <= 0.05 * len(stray):
+        stray[:] = False
+    # What is seen about a point is nearly always the background or a shadow on it: it moved as the link does, with the
+    # shadow's edge.
+    stray |= evidence.shaded > SHADED
+    if 0 < stray.sum() <= len(stray) - max(5, 0.3 * len(stray)):
         fit, plane = keep_points(fit, plane, ~stray)
         evidence = gather(video, hands, tracks, fit, plane, costs)
     keys = spread_frames(fit, costs, KEY_FRAMES)
@@ -129,7 +138,10 @@ def _cut_keys(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, evide
     wide = np.stack([cv2.dilate(m.astype(np.uint8), _disc(reach)) > 0 for m in outline])
     images = level_exposure(np.stack([to_lab(f) for f in small]), wide | hand)
     # Frames of the cut and of the evidence share the noise level; the residual decides "changed" against it.
-    change = background_residual(images, wide | hand)
+    seed = fill(evidence.chart, seed_polygon(fit, plane))
+    among = np.stack([warp_to_image(evidence.chart, seed, S @ h_t, size)
+                      for h_t in homography(fit, plane, fit.q[keys])])
+    change = background_residual(images, wide | hand, among)
     quiet = change[(change >= 0) & ~wide & ~hand]
     noise = float(np.clip(np.quantile(quiet, 0.9), 4.0, 14.0)) if len(quiet) else 8.0
     points = (fit.link_pose(fit.q[keys])[:, None, :3, :3] @ fit.points[plane.inlier][None, :, :, None])[..., 0]

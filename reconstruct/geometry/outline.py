@@ -18,8 +18,8 @@ from reconstruct.video import Video
 SIZE = 240
 """Silhouettes are compared at this long side, px."""
 TIPS = (4, 8, 12, 16, 20)
-RATIOS = (0.0, 0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.13, 0.18, 0.25, 0.35)
-"""Offsets from the plane that are tried, in parts of the link's extent."""
+RATIOS = (0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.13, 0.18, 0.25, 0.35)
+"""Thicknesses that are tried, in parts of the link's extent."""
 
 
 @dataclass(frozen=True)
@@ -244,9 +244,23 @@ def hold_points(hands: Hands, fit: JointFit, plane: LinkPlane) -> np.ndarray:
     return best[1] if best is not None else np.empty((0, 2))
 
 
-def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, masks: LinkMasks,
-                costs: np.ndarray) -> Shape:
-    """Outline and thickness of the moving link from its silhouettes.
+@dataclass(frozen=True)
+class Face:
+    """The link's outline on its plane, and what it was drawn from.
+
+    Attributes:
+        outline: plane coordinates, grown to where the hand holds it by ``reach``, world units.
+    """
+
+    outline: Polygon | MultiPolygon
+    reach: float
+    views: Views
+    chart: Chart
+
+
+def trace_face(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, masks: LinkMasks, costs: np.ndarray
+               ) -> Face:  # fmt: skip
+    """The moving link's outline from its silhouettes.
 
     Args:
         costs: (T,) from :func:`reconstruct.geometry.layers.frame_costs`.
@@ -259,8 +273,13 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
     outline = trace(chart, cells, 0.018 * plane.extent)
     if outline.is_empty:
         outline = Polygon(seed)
-    outline = tidy(outline)
-    outline, reach = _reach_hand(outline, hold_points(hands, fit, plane))
+    outline, reach = _reach_hand(tidy(outline), hold_points(hands, fit, plane))
+    return Face(outline, reach, views, chart)
+
+
+def build_shape(face: Face, fit: JointFit, plane: LinkPlane) -> Shape:
+    """How thick the moving link is, from its silhouettes."""
+    views, chart, outline = face.views, face.chart, face.outline
     extent = float(np.hypot(*(np.array(outline.bounds[2:]) - outline.bounds[:2])))
     unseen = 0.03 * extent
     if fit.type != "prismatic" and abs(float(plane.pose[:3, 2] @ fit.axis)) > 0.8:
@@ -272,24 +291,24 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
     # Only where the plane is also seen obliquely do silhouettes show the rim.
     gain = 0.004 if np.abs(plane.facing[views.frames]).min() < 0.6 else 0.02
 
-    def draw(low: float, high: float) -> float:
-        return agreement(silhouette((Slice(outline, low, high),), views, fit, plane), views)
+    def slab_of(low: float, high: float) -> Slice:
+        carved = _carve(views, fit, plane, chart, low, high)
+        # Not where the hand's reach grew the face, nor where nothing much would be left of it.
+        whole = face.reach > 0 or carved.is_empty or carved.area < 0.3 * outline.area
+        return Slice(outline if whole else carved, low, high)
 
-    # The points were seen on the surface at 0; which side the body lies on, and how deep, the outlines tell.
-    trials = {}
-    for behind in RATIOS:
-        for front in RATIOS:
-            if 0 < behind + front < 0.45:
-                trials[behind, front] = draw(-behind * extent, front * extent) - 0.02 * (behind + front)
+    def draw(body: Slice) -> float:
+        return agreement(silhouette((body,), views, fit, plane), views)
+
+    # The points were seen on the surface at 0, the body lies behind it; how deep, the silhouettes tell.
+    trials = {behind: draw(slab_of(-behind * extent, 0.0)) - 0.02 * behind for behind in RATIOS}
     best = max(trials, key=lambda k: trials[k])
-    assumed = -unseen, 0.0
     # Less than half of what is assumed is the end of the scale: silhouettes whose rims are a pixel wide say nothing.
-    told = sum(best) * extent >= 0.5 * unseen
-    if told and trials[best] > draw(*assumed) - 0.02 * unseen / extent + gain:
-        low, high, origin = -best[0] * extent, best[1] * extent, "fitted"
-    else:
-        (low, high), origin = assumed, "assumed"
-    slab = Shape((Slice(outline, low, high),), draw(low, high), origin, "slab", reach)
+    told = best * extent >= 0.5 * unseen
+    body, origin = slab_of(-unseen, 0.0), "assumed"
+    if told and trials[best] > draw(body) - 0.02 * unseen / extent + gain:
+        body, origin = slab_of(-best * extent, 0.0), "fitted"
+    slab = Shape((body,), draw(body), origin, "slab", face.reach)
     deep = _deepen(views, fit, plane, chart, slab, extent)
     if deep is not None:
         slab = deep
@@ -299,34 +318,38 @@ def build_shape(video: Video, hands: Hands, fit: JointFit, plane: LinkPlane, mas
     return stack if stack is not None and stack.iou > slab.iou + 0.03 else slab
 
 
-def off_plane(plane: LinkPlane) -> tuple[float, float]:
-    """How far behind and in front of the plane the link's body is known to reach, world units, from points whose
-    tracks the plane cannot explain: their median, if they are many on that side and beyond the others' scatter."""
-    out = plane.spread[~plane.inlier]
+def reach_behind(plane: LinkPlane) -> float:
+    """How far behind the plane the link's body is known to reach, world units, 0 if nothing is.
+
+    It is the median of points there whose tracks the plane cannot explain, if they are many and beyond the others'
+    scatter. Nothing in front counts: a body there would hide the face, so that it is something that stands on it.
+    """
     noise = 2 * float(np.quantile(np.abs(plane.spread[plane.inlier]), 0.9)) if plane.inlier.any() else 0.0
-    many = max(5, 0.08 * len(plane.spread))
-    reach = []
-    for side in (-1, 1):
-        there = side * out[side * out > noise]
-        there = there[there < 0.5 * plane.extent]
-        reach.append(float(np.median(there)) if len(there) >= many else 0.0)
-    return reach[0], reach[1]
+    behind = -plane.spread[~plane.inlier]
+    behind = behind[(behind > noise) & (behind < 0.5 * plane.extent)]
+    return float(np.median(behind)) if len(behind) >= max(5, 0.08 * len(plane.spread)) else 0.0
 
 
-def _deepen(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, slab: Shape, extent: float) -> Shape | None:
-    """The slab made as thick as points off its plane say; its outline then is where both of its faces project
-    into the silhouettes. None if no points say so, or the silhouettes fit worse."""
-    behind, front = off_plane(plane)
-    low, high = min(slab.slices[0].low, -behind), max(slab.slices[0].high, front)
-    if (low, high) == (slab.slices[0].low, slab.slices[0].high):
-        return None
+def _carve(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, low: float, high: float
+           ) -> Polygon | MultiPolygon:  # fmt: skip
+    """The outline of a slab between two heights: where both of its faces project into the silhouettes."""
     cells = None
     for z in (low, (low + high) / 2, high):
         share, total = vote(views, fit, plane, chart, z)
         unseen = total <= 0.05 * total.max()
         here = fill_unseen((share > 0.5) & ~unseen, unseen)
         cells = here if cells is None else cells & here
-    outline = tidy(trace(chart, cells, 0.018 * extent))
+    return tidy(trace(chart, cells, 0.018 * plane.extent))
+
+
+def _deepen(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, slab: Shape, extent: float) -> Shape | None:
+    """The slab made as thick as points behind its plane say; its outline then is where both of its faces project
+    into the silhouettes. None if no points say so, or the silhouettes fit worse."""
+    low, high = -reach_behind(plane), slab.slices[0].high
+    # Points tell more than an assumption does; silhouettes that showed more than they do were right.
+    if low == 0.0 or (slab.thickness_origin == "fitted" and low >= slab.slices[0].low):
+        return None
+    outline = _carve(views, fit, plane, chart, low, high)
     if outline.is_empty or outline.area < 0.3 * slab.slices[0].outline.area:
         return None
     body = (Slice(outline, low, high),)

@@ -17,6 +17,9 @@ from reconstruct.cues import Tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
+OBLIQUE = 2.0
+"""A plane oblique to the hinge must explain the tracks this many times as well as one along or across it."""
+
 
 @dataclass(frozen=True)
 class LinkPlane:
@@ -186,6 +189,10 @@ def fit_plane(tracks: Tracks, fit: JointFit) -> LinkPlane:
     if fit.type == "prismatic":
         # A slide prefers neither of the two: a drawer's front lies across it, a suitcase handle along it.
         order.sort(key=lambda k: (k == "free", refined[k][0] if k in refined else np.inf))
+    if "free" in refined and fit.type != "prismatic" and 0.2 < abs(float(refined["free"][1] @ axis)) < 0.95:
+        # Oblique to its hinge: two faces of one body far more often than one face that really lies so.
+        others = [refined[k][0] for k in refined if k != "free"]
+        lowest = min(others) if min(others) <= OBLIQUE * lowest else lowest
     kind = next(k for k in order if k in refined and refined[k][0] <= 1.15 * lowest + 0.1 * judge.unit)
     cost, normal, d = refined[kind]
 

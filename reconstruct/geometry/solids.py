@@ -54,10 +54,16 @@ def extrude(shape: Shape, plane: LinkPlane) -> Manifold:
         # Neighbouring slices overlap by a hair: faces that merely touch would stay apart.
         low = s.low - (1e-4 * (s.high - s.low) if k else 0.0)
         pieces.append(Manifold.extrude(section, s.high - low).translate([0.0, 0.0, low]))
-    solid = Manifold.batch_boolean(pieces, _add()) if len(pieces) > 1 else pieces[0]
-    solid = largest_piece(solid)
+    solid = largest_piece(united(pieces))
     size = shape.bounds[1] - shape.bounds[0]
     return posed(solid.simplify(1e-3 * float(np.linalg.norm(size))), plane.pose)
+
+
+def united(solids: list[Manifold]) -> Manifold:
+    """All of them as one."""
+    from manifold3d import Manifold
+
+    return Manifold.batch_boolean(solids, _add()) if len(solids) > 1 else solids[0]
 
 
 def largest_piece(solid: Manifold, share: float = 0.0) -> Manifold:
@@ -67,9 +73,7 @@ def largest_piece(solid: Manifold, share: float = 0.0) -> Manifold:
         return solid
     most = max(p.volume() for p in pieces)
     keep = [p for p in pieces if p.volume() >= (share if share > 0 else 1.0) * most]
-    from manifold3d import Manifold
-
-    return keep[0] if len(keep) == 1 else Manifold.batch_boolean(keep, _add())
+    return united(keep)
 
 
 def _add() -> OpType:

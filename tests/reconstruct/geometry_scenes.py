@@ -35,10 +35,33 @@ def _texture(rng: np.random.Generator, base: tuple[int, int, int], size: int = 1
     return np.clip(image * contrast / 1.7 + np.array(base), 0, 255).astype(np.uint8)
 
 
-def make_scene(kind: str = "revolute", unit: float = 1.0, seed: int = 0, hand: bool = True) -> Scene:
+BAR = np.array([[0.08, -0.06, 0.08], [0.11, -0.05, 0.24]])
+"""Low and high corner of the bar that may stand before the slab's face, its posts left out."""
+
+
+def _faces(low: np.ndarray, high: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Corners (4, 3) and outward normal (3,) of a box's sides."""
+    faces = []
+    for a in range(3):
+        b, c = [k for k in range(3) if k != a]
+        for side, level in ((-1.0, low[a]), (1.0, high[a])):
+            corners = np.empty((4, 3))
+            corners[:, a] = level
+            corners[:, b] = [low[b], high[b], high[b], low[b]]
+            corners[:, c] = [low[c], low[c], high[c], high[c]]
+            normal = np.zeros(3)
+            normal[a] = side
+            faces.append((corners, normal))
+    return faces
+
+
+def make_scene(kind: str = "revolute", unit: float = 1.0, seed: int = 0, hand: bool = True, bar: bool = False,
+               shadow: bool = False) -> Scene:  # fmt: skip
     """A slab 0.4 x 0.02 x 0.3 (times ``unit``) that turns about its left edge or slides sideways.
 
-    A pale disc, the hand, rides on the free edge and is in ``hands``.
+    A pale disc, the hand, rides on the free edge and is in ``hands``.  bar: a dark :data:`BAR` stands before its face.
+    shadow: the background below it is dark where the slab's plane goes on, and the last 12 points follow
+    that shadow's corners.
     """
     rng = np.random.default_rng(seed)
     low, high = np.array([0.0, -0.01, 0.0]) * unit, np.array([0.4, 0.01, 0.3]) * unit
@@ -59,21 +82,19 @@ def make_scene(kind: str = "revolute", unit: float = 1.0, seed: int = 0, hand: b
                    metric=unit == 1.0, residual_px=0.5, moving_frames=np.abs(np.gradient(q)) > 0)
     back = cv2.resize(_texture(rng, (120, 110, 90)), (WIDTH, HEIGHT))
     skins = [_texture(rng, (70, 130, 190)) for _ in range(6)]
-    faces = []
-    for a in range(3):
-        b, c = [k for k in range(3) if k != a]
-        for side, level in ((-1.0, low[a]), (1.0, high[a])):
-            corners = np.empty((4, 3))
-            corners[:, a] = level
-            corners[:, b] = [low[b], high[b], high[b], low[b]]
-            corners[:, c] = [low[c], low[c], high[c], high[c]]
-            normal = np.zeros(3)
-            normal[a] = side
-            faces.append((corners, normal))
+    faces = _faces(low, high)
+    if bar:
+        faces += _faces(*(BAR * unit))
+        skins += [np.full((128, 128, 3), 40, np.uint8)] * 6
+    dark = np.array([[0.02, 0, -0.12], [0.36, 0, -0.12], [0.36, 0, 0.0], [0.02, 0, 0.0]]) * unit
     frames, masks, hand_masks, tips = [], [], [], []
     for t in range(FRAMES):
         T = fit.link_pose(q[t])
         image, mask = back.copy(), np.zeros((HEIGHT, WIDTH), np.uint8)
+        if shadow:
+            shape = np.zeros_like(mask)
+            cv2.fillConvexPoly(shape, np.round(fit.project(dark @ T[:3, :3].T + T[:3, 3])).astype(np.int32), 1)
+            image[shape > 0] = (0.6 * image[shape > 0]).astype(np.uint8)
         for (corners, normal), skin in zip(faces, skins, strict=True):
             x = corners @ T[:3, :3].T + T[:3, 3]
             if (T[:3, :3] @ normal) @ (eye - x.mean(0)) <= 0:
@@ -99,10 +120,15 @@ def make_scene(kind: str = "revolute", unit: float = 1.0, seed: int = 0, hand: b
     # Points on the front face, with noise along the rays as a fit has, and a few that are wrong.
     n = 60
     points = low + rng.random((n, 3)) * (high - low) * [0.8, 0, 0.9]
+    if bar:
+        points = np.concatenate([points, (BAR[0] + rng.random((12, 3)) * (BAR[1] - BAR[0]) * [1, 0, 1]) * unit])
+    if shadow:
+        points = np.concatenate([points, np.tile(dark[[0, 1]], (6, 1)) + rng.normal(size=(12, 3)) * 0.002 * unit])
+    n = len(points)
     poses = fit.link_pose(q)
     moved = np.einsum("tij,nj->nti", poses[:, :3, :3], points) + poses[None, :, :3, 3]
     uv = fit.project(moved) + rng.normal(size=(n, FRAMES, 2)) * 0.3
-    far = np.where(rng.random(n) < 0.06, 0.15, 0.004)
+    far = np.where((rng.random(n) < 0.06) & (np.arange(n) < 60), 0.15, 0.004)
     noisy_points = eye + (points - eye) * (1 + rng.normal(size=n) * far)[:, None]
     fit = replace(fit, points=noisy_points, point_track=np.arange(n), inliers=n, tracks=n,
                   std={"axis_deg": 0.5, "point_m": 0.002 * unit, "q": np.full(FRAMES, 0.005)})
