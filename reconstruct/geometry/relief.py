@@ -112,8 +112,7 @@ def find_raised(video: Video, fit: JointFit, plane: LinkPlane, face: Polygon | M
     # Where the hand covers the face behind it, what stands out is only not contradicted.
     free = inside & ~sweep.known & (sweep.least < QUIET)
     out: list[Raised] = []
-    while (found := _largest(sweep, inside, clear, free, points, LEAST * diagonal)) is not None:
-        cells, count = found
+    while (cells := _largest(sweep, inside, clear, free, points, LEAST * diagonal)) is not None:
         # About an edge that hides what is behind it cells agree at many heights: those at the region's own stay.
         height = float(np.median(levels[sweep.best[cells & clear]]))
         level = int(np.argmin(np.abs(levels - height)))
@@ -122,10 +121,13 @@ def find_raised(video: Video, fit: JointFit, plane: LinkPlane, face: Polygon | M
         core = cv2.morphologyEx((cells & own).astype(np.uint8), cv2.MORPH_OPEN, _square(3))
         region = trace(chart, core > 0, chart.cell)
         region = max(region.geoms, key=lambda g: g.area) if isinstance(region, MultiPolygon) else region
-        if region.area >= SMALLEST * face.area:
-            out.append(_built(region, height, count))
-        around = cv2.dilate(cells.astype(np.uint8), _square(BRIDGE)) > 0
-        clear, free = clear & ~around, free & ~around
+        # What is left has to be where the points are, or they stood beside it.
+        around = region.buffer(2 * chart.cell)
+        standing = contains_xy(around, points[:, 0], points[:, 1]) & (np.abs(points[:, 2] - height) <= APART * height)
+        if region.area >= SMALLEST * face.area and standing.sum() >= POINTS:
+            out.append(_built(region, height, int(standing.sum())))
+        taken = cv2.dilate(cells.astype(np.uint8), _square(BRIDGE)) > 0
+        clear, free = clear & ~taken, free & ~taken
     return tuple(out)
 
 
@@ -157,14 +159,14 @@ class _Sweep:
 
 
 def _largest(sweep: _Sweep, inside: np.ndarray, clear: np.ndarray, free: np.ndarray, points: np.ndarray, lowest: float
-             ) -> tuple[np.ndarray, int] | None:  # fmt: skip
-    """The connected cells at one height, among all heights, of which most stand out clearly and in which tracked
-    points stand too: (rows, cols) bool, and how many points."""
+             ) -> np.ndarray | None:  # fmt: skip
+    """(rows, cols) bool, the connected cells at one height, among all heights, of which most stand out clearly and in
+    which tracked points stand too."""
     import cv2
 
     chart, levels = sweep.chart, sweep.levels
     spots = np.round((points[:, :2] - chart.origin) / chart.cell).astype(int).clip(0, np.array(chart.shape[::-1]) - 1)
-    largest, most, count = None, 0, 0
+    largest, most = None, 0
     for height in levels[levels > lowest]:
         about = np.abs(levels - height) <= APART * height
         cells = (clear | free) & about[sweep.best]
@@ -183,8 +185,8 @@ def _largest(sweep: _Sweep, inside: np.ndarray, clear: np.ndarray, free: np.ndar
         told[0] = 0
         k = int(told.argmax())
         if told[k] > most:
-            largest, most, count = labels == k, int(told[k]), int(support[k])
-    return None if largest is None else (largest, count)
+            largest, most = labels == k, int(told[k])
+    return largest
 
 
 def _square(side: int) -> np.ndarray:
