@@ -28,6 +28,7 @@ from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import (
     Spread,
     clusters,
+    compact,
     lasting_error,
     shared_error,
     shared_weights,
@@ -503,18 +504,6 @@ def _apart_deg(one: Bundle, other: Bundle) -> float:
 def turn_deg(b: Bundle) -> float:
     """By how much the link turns."""
     return float(np.degrees(np.ptp(b.q) * np.linalg.norm(b.twist.curvature)))
-
-
-def compact(X: np.ndarray, reach: float = 2.5) -> np.ndarray:
-    """(N,) bool: points within `reach` link sizes of the link's middle.
-
-    A stray track that the joint happens to explain is placed far in front of or behind the link; the link's size is
-    read across the line of sight, where strays count as everything else.
-    """
-    middle = np.median(X, axis=0)
-    across = X[:, :2] / np.maximum(X[:, 2:], 1e-3) * middle[2]
-    size = float(np.linalg.norm(np.quantile(across, 0.9, axis=0) - np.quantile(across, 0.1, axis=0)))
-    return np.linalg.norm(X - middle, axis=1) < reach * max(size, 1e-6)
 
 
 def states_of_all_frames(b: Bundle, s: Sightings, some: np.ndarray) -> Bundle:

@@ -54,6 +54,18 @@ def clusters(b: Bundle, link: np.ndarray | None = None, cell: float = CELL) -> n
     return np.unique(key, axis=0, return_inverse=True)[1].ravel()
 
 
+def compact(X: np.ndarray, reach: float = 2.5) -> np.ndarray:
+    """(N,) bool: points within `reach` link sizes of the link's middle.
+
+    A stray track that the joint happens to explain is placed far in front of or behind the link; the link's size is
+    read across the line of sight, where strays count as everything else.
+    """
+    middle = np.median(X, axis=0)
+    across = X[:, :2] / np.maximum(X[:, 2:], 1e-3) * middle[2]
+    size = float(np.linalg.norm(np.quantile(across, 0.9, axis=0) - np.quantile(across, 0.1, axis=0)))
+    return np.linalg.norm(X - middle, axis=1) < reach * max(size, 1e-6)
+
+
 def shared_error(r: np.ndarray, seen: np.ndarray, cluster: np.ndarray) -> float:
     """Intraclass correlation of the residuals (N, T, 2) within clusters, in [0, 1]."""
     count = cluster.max() + 1
@@ -173,8 +185,11 @@ def spread(b: Bundle, s: Sightings) -> Spread:
 
     by_d, by_w = np.zeros((3, len(S))), np.zeros((3, len(S)))
     by_d[:, :G], by_w[:, :G] = n.Z[:3], n.Z[3:]
-    # Mean depth of the link's points, the unit of length; each as much as it counts: nothing holds one that strayed.
-    share = w.sum(1) * link / max(float(w[link].sum()), 1e-12)
+    # Mean depth of the link's points, the unit of length; each as much as it counts, and none that strayed: nothing
+    # holds the depth of a track that the joint happens to explain.
+    share = w.sum(1) * link
+    share[link] *= compact(b.X[link])
+    share /= max(float(share.sum()), 1e-12)
     unit = float(share @ b.X[:, 2])
     by_unit = -np.einsum("n,nj,pnj->p", share, inv[:, 2], n.C, optimize=True)
     own = white * float(share**2 @ inv[:, 2, 2])

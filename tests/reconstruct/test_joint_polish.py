@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.finish import FREE_BODY, compact, type_probabilities
+from reconstruct.joint.finish import FREE_BODY, type_probabilities
 from reconstruct.joint.kinds import tempered, votes
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.polish import (
@@ -23,7 +23,7 @@ from reconstruct.joint.polish import (
     residuals,
 )
 from reconstruct.joint.twist import Twist, twist_of_joint
-from reconstruct.joint.uncertainty import lasting_error, shared_error, spread, strayed
+from reconstruct.joint.uncertainty import compact, lasting_error, shared_error, spread, strayed
 
 FOCAL, SIGMA = 700.0, 0.5
 number = st.floats(-2, 2)
@@ -195,6 +195,15 @@ def test_points_find_their_place_and_strays_are_told_apart():
     assert np.median(np.linalg.norm(found.X - truth.X, axis=1)) < 0.02
     X = np.concatenate([truth.X, truth.X[:3] * 4])
     assert compact(X).tolist() == [True] * len(truth.X) + [False] * 3
+
+
+def test_a_point_whose_depth_nothing_holds_says_nothing_about_the_unit():
+    truth, s = scene("revolute", 5)
+    seen, X = s.seen.copy(), truth.X.copy()
+    seen[0, 1:] = False  # one frame: every depth explains it
+    X[0] *= 100
+    stated = spread(replace(truth, X=X), replace(s, seen=seen))
+    assert stated.point == pytest.approx(spread(truth, s).point, rel=0.1)
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
