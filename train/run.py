@@ -31,6 +31,7 @@ from stable_baselines3.common.logger import Logger, configure
 from taa_envs.asset import Asset
 from taa_envs.errors import TaaEnvsError
 from taa_envs.files import written_whole
+from taa_envs.randomize import uncertainties
 from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config
 from train.evaluate import episodes as run_episodes
@@ -106,7 +107,7 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
         TaaEnvsError: the folder holds a run with other settings, or something else.
     """
     folder = Path(folder)
-    described = {"asset": asset.id, "model_sha256": hashlib.sha256(asset.model_path.read_bytes()).hexdigest(),
+    described = {"asset": asset.id, "asset_sha256": digest(asset),
                  **{k: v for k, v in config.as_dict().items() if k not in FREE}}
     _claim(folder, described)
     batch = BatchedArticulationEnv(asset, config.envs, autoreset_mode="same_step", reward=config.reward,
@@ -177,6 +178,15 @@ def train(asset: Asset, config: Config, folder: Path, *, minutes: float | None =
     return {"run": str(folder), "policy": str(folder / "policy.pt"), "resumed_at": resumed,
             "steps": made, "guided": guided,
             **{k: None if np.isnan(last[k]) else last[k] for k in COLUMNS[2:] if k in last}}
+
+
+def digest(asset: Asset) -> str:
+    """SHA-256 of what a policy is trained on: the model, the demonstration, and what randomisation draws from."""
+    out = hashlib.sha256(asset.model_path.read_bytes())
+    for _, array in sorted(asset.reference.arrays().items()):
+        out.update(np.ascontiguousarray(array).tobytes())
+    out.update(json.dumps([uncertainties(asset), asset.joint.get("std")], sort_keys=True).encode())
+    return out.hexdigest()
 
 
 class _Judge:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import hashlib
 import json
 import platform
 from collections.abc import Sequence
@@ -30,7 +29,7 @@ from taa_envs.registry import find_assets, get_asset, shipped_folder
 from train.config import load_config
 from train.evaluate import evaluate
 from train.film import wall
-from train.run import train
+from train.run import digest, train
 
 GOAL = 0.95
 """Success that a policy is to reach."""
@@ -64,8 +63,8 @@ def make(asset: Asset, algo: str, seed: int, minutes: float, steps: int | None, 
     replay: of an evaluation of the same asset with as many episodes.
     """
     folder = out / f"{asset.id}-{algo}-{seed}"
-    file, model = folder / "zoo.json", hashlib.sha256(asset.model_path.read_bytes()).hexdigest()
-    wanted = {"minutes": minutes, "steps": steps, "episodes": episodes, "model_sha256": model}
+    file = folder / "zoo.json"
+    wanted = {"minutes": minutes, "steps": steps, "episodes": episodes, "asset_sha256": digest(asset)}
     known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if known.get("wanted") != wanted:
         trained = train(asset, load_config(algo, seed=seed, steps=steps), folder, minutes=minutes)

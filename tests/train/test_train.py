@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,10 @@ def test_a_folder_holds_one_run(door: Asset, tmp_path: Path) -> None:
     assert done["resumed_at"] == done["steps"] == 256  # nothing left to do
     with pytest.raises(TaaEnvsError, match="other settings"):
         train(door, Config(**{**small.as_dict(), "seed": 1}), tmp_path / "run")
+    # What is drawn belongs to what was trained on: the same model, known less well, is another asset.
+    vague = replace(door, provenance={**door.provenance, "hand.offset": {"value": 0.0, "origin": "fitted", "std": 0.5}})
+    with pytest.raises(TaaEnvsError, match="of another asset"):
+        train(vague, small, tmp_path / "run")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("x")
     with pytest.raises(TaaEnvsError, match="not a training run"):
