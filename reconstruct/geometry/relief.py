@@ -50,6 +50,8 @@ APART = 0.3
 """By this share of a region's height its points and cells may differ from it."""
 BRIDGE = 13
 """Cells across which an even surface is taken to stand out with its rims."""
+MARGIN = 0.015
+"""About a hand's mask nothing is looked at, in parts of the window's longer side."""
 SMALLEST = 0.002
 """Area of a region, share of the face's."""
 LONG = 2.5
@@ -226,8 +228,9 @@ def _sweep(video: Video, fit: JointFit, plane: LinkPlane, face: Polygon | MultiP
     chart = Chart(low, cell, (int(rows), int(columns)))
     window = make_window(video, fit, plane, max(video.frames.shape[1:3]))
     images = np.stack([to_lab(window.crop(video.frames[t])) for t in frames])
-    free = ~np.stack([cv2.dilate(window.crop(masks.hand[t]).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-                      for t in frames])  # fmt: skip
+    # A driving hand stands before the face and rests on it: what its mask misses must not be taken for a handle.
+    margin = _square(2 * max(2, round(MARGIN * max(window.size))) + 1)
+    free = ~np.stack([cv2.dilate(window.crop(masks.hand[t]).astype(np.uint8), margin) > 0 for t in frames])
     S, weight = window.matrix(video), plane.facing[frames]
     grid = np.mgrid[: chart.shape[0], : chart.shape[1]][::-1].transpose(1, 2, 0).astype(float)
 
