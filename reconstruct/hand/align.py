@@ -36,6 +36,7 @@ from reconstruct.video import Video
 
 ONSET = 0.1  # s before the part moves in which a touching hand begins to press
 MAX_BACK = 0.03  # m by which a waiting hand stays back from its grip at most
+OWN_SHARE = 0.05  # of the stroke, in which the hand must be seen to drive for these frames to say how it holds the part
 FOUND_SECONDS = 0.15  # a hand that holds on so soon after it is found was holding on before
 DEPTH_FLOOR, ACROSS_FLOOR = 0.01, 0.005  # m, least standard deviations of an aligned hand
 TIPS_STD = 0.005  # m of a finger tip: landmark noise of 4 % of a palm, and the 4 mm by which tips are pressed in
@@ -196,7 +197,12 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     hand = hands.tracks[drive.index]
     notes: list[str] = []
     seen = observe(hands, drive.index, fit.K, rate)
+    sign = _stroke_sign(fit.q)
+    forward = np.maximum(sign * np.gradient(fit.q), 0.0)
     use = drive.drives & seen.valid
+    if forward[use].sum() < OWN_SHARE * forward.sum():
+        # What is replayed is the stroke; a hand that is seen to drive only its way back may hold it otherwise.
+        use = drive.attached & drive.near & (forward > 0) & moving & seen.valid
     if use.sum() < 3:
         return _absent(video, fit, shape, "the driving hand's position could not be computed")
     measured = hand.placed is not None
@@ -219,8 +225,6 @@ def align_hand(video: Video, hands: Hands, fit: JointFit, geometry: Geometry, ma
     if carried.any():
         notes.append(f"hand not seen in {int((carried & moving).sum())} frames in which the part moves: "
                      "assumed to hold on, carried with the part")
-    sign = _stroke_sign(fit.q)
-    forward = np.maximum(sign * np.gradient(fit.q), 0.0)
     weight = forward[use] if forward[use].sum() > 0 else np.abs(np.gradient(fit.q))[use]
     rest = rest_pose(_to_link(pose[use], world[use]), weight)
     key = int(np.flatnonzero(use)[weight.argmax()])

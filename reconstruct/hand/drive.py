@@ -17,6 +17,7 @@ from reconstruct.joint.models import JointFit
 
 NEAR, BESIDE = 0.6, 1.5  # palm sizes between the nearest finger joint and the part's outline: at it, and beside it
 AGREE = 0.5  # difference of the motions, relative to the part's own
+BLINK = 0.15  # s without a hand between frames in which it is at the part
 WINDOWS = (0.2, 0.4, 0.7, 1.0)  # s over which motion is compared, the shortest that shows enough of it
 
 
@@ -207,6 +208,9 @@ def find_drive(hands: Hands, fit: JointFit, time: np.ndarray, surface: np.ndarra
         return Drive(None, nobody, nobody, nobody)
     index, near, drives, beside, differ = best
     valid = hands.tracks[index].valid
+    # A hand that is missed for a moment is meanwhile where it was.
+    blink = round(BLINK * rate)
+    near, beside = (flags | (close_gaps(flags, blink) & ~valid) for flags in (near, beside))
     attached = _extend(close_gaps(drives, 4), moving, near, beside, differ)
     # Between two driven stretches a hand that never leaves the part rests on it.
     stretches = runs(attached)

@@ -203,3 +203,19 @@ def test_runs_and_gaps() -> None:
     flags = np.array([0, 1, 1, 0, 1, 0, 0, 0, 1], bool)
     assert runs(flags) == [(1, 3), (4, 5), (8, 9)]
     assert runs(close_gaps(flags, 1)) == [(1, 5), (8, 9)]
+
+
+def test_a_hand_that_is_missed_for_a_moment_drove_the_part_before_too() -> None:
+    scene = make_scene("drawer", gap=None)
+    track, lost = scene.hands.tracks[0], 50
+    uv, valid = track.uv.copy(), track.valid.copy()
+    # Before, the landmarks shake by more than the part moves in the picture: that the hand drives cannot be seen there.
+    shake = np.random.default_rng(0).choice([-1.0, 1.0], lost) * np.linalg.norm(uv[lost, 0] - uv[lost, 9]) * 0.4
+    uv[:lost] += shake[:, None, None]
+    valid[lost] = False
+    hands = Hands((replace(track, uv=uv, valid=valid),), scene.hands.mask, scene.hands.provider)
+    drive = find_drive(hands, scene.fit, scene.video.time)
+    assert drive.index == 0 and not drive.drives[:lost - 10].any()
+    begins, ends = np.flatnonzero(scene.contact)[[0, -1]]
+    first, last = np.flatnonzero(drive.attached)[[0, -1]]
+    assert abs(first - begins) < 12 and abs(last - ends) < 12
