@@ -24,7 +24,7 @@ class Config:
         reward, action, randomize: of the environment.
         hold: environment steps for which the policy's action is held.
         evaluate_every, evaluate_episodes, enough: environment steps between evaluations without exploration (0: none),
-            episodes of one (of an imperfect policy's, 32), and the success at which training ends.
+            episodes of one (of a middling policy's, 32), and the success at which training ends.
         anneal_to, anneal_steps: PPO's log standard deviation is held below a line to this value at so many steps.
         guide_episodes: draws in which PPO on residual actions first imitates a guide, see :mod:`train.guide`; 0: none,
             nor where ``steps`` has no room for it.

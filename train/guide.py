@@ -18,6 +18,7 @@ import torch
 from stable_baselines3 import PPO
 
 from taa_envs.asset import Asset
+from taa_envs.scene import CONTROL_PERIOD
 from taa_envs.vector import BatchedArticulationEnv
 from train.config import Config
 from train.policy import Policy
@@ -30,7 +31,8 @@ class Way(NamedTuple):
     first, last: m by which it presses along the link's motion when that begins, and later. Less than nothing: it holds
     back by so much, from :data:`LEAD` before.  full: share of the stroke at which it presses by ``last``.  pace: of
     the reference's clock while it drives, an action.  follow: whether it goes after a link that runs ahead of the
-    reference.
+    reference.  foresee: s by which it looks ahead at where the link goes.  wait: m by which the link may lag at the
+    hand before the clock stands.  inward: m towards a hinge.
     """
 
     first: float
@@ -38,14 +40,22 @@ class Way(NamedTuple):
     full: float = 1.0
     pace: float = 0.0
     follow: bool = False
+    foresee: float = 0.0
+    wait: float = np.inf
+    inward: float = 0.0
 
 
 # A link that the arriving hand flings coasts ahead of it, which is no success: a hand that comes late and slowly flings
-# less, one that goes after the link goes on driving it. What is best depends on the joint.
-WAYS = (Way(-0.04, 0.03, 0.5, -0.3, True), Way(-0.04, 0.06, 0.7, -0.5), Way(-0.02, 0.04, 0.5, -0.3, True),
-        Way(0.01, 0.03))  # fmt: skip
+# less, one that goes after the link goes on driving it, and one that waits for a heavy link keeps hold of it. A hand
+# that reaches further in than the person's does not slip off a lid's edge when it errs. What is best depends on the
+# joint.
+WAYS = (Way(0.01, 0.05, pace=-0.15, inward=0.03), Way(-0.02, 0.04, 0.5, -0.3, True, inward=0.02),
+        Way(-0.04, 0.03, 0.5, -0.5, True, foresee=0.2, wait=0.06))  # fmt: skip
 LEAD = 0.6  # s
-TRIALS = 32  # draws in which each way is tried
+STAND = -2 / 3  # action at which the reference's clock stands
+TRIALS = 64  # draws in which each way is tried
+SLIP = 0.05  # of an action of 1: so clumsy, up to here, is the guide in the trials. Its pupil will be
+USED = (0, 1, 2, 7)  # numbers of an action by which the guide works: translation and the clock
 STARTED = 0.005  # of the stroke: from here on the demonstrated hand drives
 SEED = 250_000  # of the guide's first episode: not the training's, nor those of evaluations
 ROUNDS = 3  # of as many episodes of the policy's own, which the guide comments
@@ -78,29 +88,51 @@ class Guide:
                            zip(("axis", "point"), self.nominal, strict=True))  # fmt: skip
         self.offset = np.array(drawn.get("hand", np.zeros((n, 3))))
         self.sign = np.sign(demo["q_demo_end"] - demo["q_start"])
-        self.first, self.last, self.full, self.pace, self.follow = np.array(ways, float).T
+        self.first, self.last, self.full, self.pace, self.follow, self.foresee, self.wait, self.inward = (
+            np.array(ways, float).T)
         reference = self.asset.reference
         drives = self.asset.stroke_fraction(reference.q) > STARTED
         self.begin = reference.time[np.argmax(drives)] - np.where(self.first < 0, LEAD, 0.0)
+        self.period = env.hold * CONTROL_PERIOD  # s between decisions
+        self.was = self.task.q.copy()
 
     def act(self) -> np.ndarray:
         """(n, A) float32 residual actions for the next decision."""
         task, asset, reference = self.task, self.asset, self.asset.reference
         q = np.interp(task.time, reference.time, reference.q)
         stroke = asset.stroke_fraction(q)
+        started = stroke > STARTED
         palm = task.path(task.time).mean(1)
         home = carried(asset, self.nominal, -q, palm)
-        ahead = np.maximum((task.q - q) * self.sign, 0) * (stroke > STARTED)
-        q = q + self.follow * ahead * self.sign
+        arm = np.linalg.norm(self._onward(q, home), axis=1)
+        speed = np.maximum((task.q - self.was) * self.sign, 0) / self.period
+        self.was = task.q.copy()
+        lead = ((task.q - q) * self.sign + self.foresee * speed) * started
+        lag = np.maximum(-lead, 0) * arm
+        q = q + self.follow * np.maximum(lead, 0) * self.sign
         there = carried(asset, self.drawn, q, home)
-        onward = carried(asset, self.drawn, q + 1e-3 * self.sign, home) - there
+        onward = self._onward(q, home)
         onward /= np.maximum(np.linalg.norm(onward, axis=1, keepdims=True), 1e-12)
         press = self.first + (self.last - self.first) * np.clip(stroke / self.full, 0, 1)
         shift = there - palm - self.offset + (press * (task.time >= self.begin))[:, None] * onward
+        if asset.joint_type != "prismatic":
+            shift += self.inward[:, None] * self._inward(there)
         out = np.zeros((len(q), task.action_size), np.float32)
         out[:, :3] = np.clip(shift / task.translation, -1, 1)
-        out[:, 7] = self.pace * (stroke > STARTED)
+        out[:, USED[-1]] = np.maximum(self.pace - (self.pace - STAND) * np.minimum(lag / self.wait, 1), STAND) * started
         return out
+
+    def _onward(self, q: np.ndarray, home: np.ndarray) -> np.ndarray:
+        """(n, 3) m a rad or m, which way and how fast the palm moves with the drawn joint."""
+        step = 1e-3 * self.sign
+        return (carried(self.asset, self.drawn, q + step, home) - carried(self.asset, self.drawn, q, home)) / 1e-3
+
+    def _inward(self, x: np.ndarray) -> np.ndarray:
+        """(n, 3) unit vectors from points x (n, 3) m to the drawn axis."""
+        axis, point = self.drawn
+        off = point - x
+        off -= (off * axis).sum(1, keepdims=True) * axis
+        return off / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-12)
 
 
 @dataclass(frozen=True)
@@ -121,8 +153,16 @@ class Played:
         return out
 
 
-def play(env: BatchedArticulationEnv, seed: int, ways: list[Way], policy: Policy | None = None) -> Played:
-    """One episode in each simulation, driven by the policy or else by the guide, who advises in any case."""
+def play(env: BatchedArticulationEnv, seed: int, ways: list[Way], policy: Policy | None = None,
+         slip: np.ndarray | float = 0.0) -> Played:  # fmt: skip
+    """One episode in each simulation, driven by the policy or else by the guide, who advises in any case.
+
+    slip: (n,) standard deviation of what the driver errs by in a whole episode, in each number of its action that the
+    guide uses; half as much comes anew with every decision.
+    """
+    rng = np.random.default_rng(seed)
+    spread = np.broadcast_to(slip, env.num_envs)[:, None] * np.isin(np.arange(env.task.action_size), USED)
+    habit = spread * rng.normal(size=spread.shape)
     observation, info = env.reset(seed=seed)
     guide = Guide(env, info.get("randomized", {}), ways)
     live, won = np.ones(env.num_envs, bool), np.zeros(env.num_envs, bool)
@@ -131,6 +171,8 @@ def play(env: BatchedArticulationEnv, seed: int, ways: list[Way], policy: Policy
         advised = guide.act()
         before, was = observation, live.copy()
         action = advised if policy is None else policy.act(observation)
+        if np.any(spread):
+            action = np.clip(action + habit + 0.5 * spread * rng.normal(size=spread.shape), -1, 1).astype(np.float32)
         observation, rewards, terminated, truncated, info = env.step(action)
         ended = live & (terminated | truncated)
         won[ended] = info["is_success"][ended]
@@ -148,8 +190,8 @@ def most_steps(config: Config, longest: int) -> int:
 def teach(model: PPO, asset: Asset, config: Config, normal: Normal) -> int:
     """Make a fresh policy imitate the guide, and its critic expect what the policy then gets.
 
-    The way that succeeds most often in a few draws is the guide's; it drives in ``config.guide_episodes`` draws and
-    comments the policy in as many fresh ones a round.
+    The way that succeeds most often in a few draws, most of them with clumsy hands, is the guide's; it drives in
+    ``config.guide_episodes`` draws and comments the policy in as many fresh ones a round.
 
     Returns:
         environment steps simulated.
@@ -162,7 +204,7 @@ def teach(model: PPO, asset: Asset, config: Config, normal: Normal) -> int:
 
     seed = SEED + 1000 * config.seed
     env = batch(TRIALS)
-    tried = [play(env, seed, [way] * TRIALS) for way in WAYS]
+    tried = [play(env, seed, [way] * TRIALS, slip=np.linspace(0, SLIP, TRIALS)) for way in WAYS]
     env.close()
     way = WAYS[int(np.argmax([run.won.mean() for run in tried]))]
     env, policy = batch(n), Policy(model.policy, normal, config.hold)

@@ -72,6 +72,45 @@ def test_the_guide_takes_back_what_was_drawn(door: Asset) -> None:
     assert np.linalg.norm(moved[0]) == pytest.approx(2 * np.sin(abs(q) / 2) * 0.02, abs=2e-4)
 
 
+def test_the_guide_reaches_in_and_waits_as_it_is_told(door: Asset) -> None:
+    env = BatchedArticulationEnv(door, 2)
+    env.reset(seed=0)
+    aside = env.reference_action()
+    aside[:, 2] = 1.0  # the hand passes higher, the door lags
+    for _ in range(60):
+        env.step(aside)
+    q = np.interp(env.task.time, door.reference.time, door.reference.q)
+    assert (door.stroke_fraction(q) > door.stroke_fraction(env.task.q) + 0.01).all()
+    axis, point = np.array(door.joint["axis"], float), np.array(door.joint["point"], float)
+    said = Guide(env, {}, [Way(0.0, 0.0, pace=0.1), Way(0.0, 0.0, pace=0.1, wait=1e-4, inward=0.02)]).act()
+    assert np.allclose(said[:, 7], [0.1, guide.STAND])
+    still, inward = env.task.path(env.task.time).mean(1) + said[:, :3] * env.task.translation
+    assert np.linalg.norm(np.cross(still - point, axis)) - np.linalg.norm(np.cross(inward - point, axis)) == (
+        pytest.approx(0.02, abs=1e-4))
+    assert abs((inward - still) @ axis) < 1e-6  # not along it
+
+
+def test_a_clumsy_driver_errs_as_much_as_stated_and_alike_under_a_seed(door: Asset,
+                                                                       monkeypatch: pytest.MonkeyPatch) -> None:
+    env, acted = BatchedArticulationEnv(door, 32), []
+    step = env.step
+    monkeypatch.setattr(env, "step", lambda action: acted.append(action.copy()) or step(action))
+    ways = [Way(0.0, 0.0)] * 32
+
+    def errors(slip: np.ndarray | float) -> np.ndarray:
+        acted.clear()
+        advised = play(env, 5, ways, slip=slip).advised
+        return np.array(acted)[:10] - advised[:10]
+
+    assert not errors(0.0).any()
+    first, again = errors(np.linspace(0, 0.05, 32)), errors(np.linspace(0, 0.05, 32))
+    assert (first == again).all()
+    used = np.isin(np.arange(first.shape[-1]), guide.USED)
+    assert not first[..., ~used].any() and not first[:, 0].any()
+    habit = first[:, 16:].mean(0)[:, used]  # of the clumsier half; what comes anew evens out
+    assert 0.02 < habit.std() < 0.06
+
+
 def test_a_policy_learns_what_the_guide_says(door: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guide, "TRIALS", 4)
     monkeypatch.setattr(guide, "WAYS", guide.WAYS[:2])
