@@ -200,3 +200,12 @@ def test_tracks_of_rendered_pixels_lie_on_the_surfaces_they_were_seeded_on():
     # The seeds are exact by construction.
     seeds = error[np.arange(len(error)), scene.seed]
     assert np.nanmax(seeds[scene.moving]) < 0.05
+
+
+@pytest.mark.parametrize(("option", "name"), [("--motions", "jump"), ("--objects", "sofa")])
+def test_unknown_names_are_refused_in_one_line(option: str, name: str, capsys: pytest.CaptureFixture) -> None:
+    from benchmarks.articulation.__main__ import main
+
+    with pytest.raises(SystemExit) as stopped:
+        main([option, name])
+    assert stopped.value.code == 2 and f"no {option[2:]} {name}; known: " in capsys.readouterr().err

@@ -133,6 +133,12 @@ def main(argv: list[str] | None = None) -> int:
         print(markdown(rows))
         print(worst(rows), file=sys.stderr)
         return 0
+    from benchmarks.articulation.motions import MOTIONS
+
+    known = {n for model in _models() for n in (model, model.split("/")[0])}
+    for wanted, there, what in ((args.motions, set(MOTIONS), "motions"), (args.objects, known, "objects")):
+        if missing := set(wanted or ()) - there:
+            parser.error(f"no {what} {', '.join(sorted(missing))}; known: {', '.join(sorted(there))}")
     todo = list(cases(args))
     if args.limit and args.limit < len(todo):
         # The same order for every limit: a larger one goes on with the cases of a smaller one.
