@@ -194,6 +194,8 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
     last = {st.twist.kind: st}
     least = min(cost for _, cost in first.values())
     lost = {kind for kind, (_, cost) in first.items() if cost > least + HOPELESS * inflation}
+    if st.twist.kind == "screw":  # what it holds as special cases may only have started badly
+        lost -= {kind for kind in lost if _holds(st, kind, obs, noise, inflation)}
     last |= {kind: first[kind][0] for kind in lost}
     for kind in KINDS:
         if kind not in last:
@@ -203,6 +205,13 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
     agreed = replace(obs, seen=good > 0, ranged=obs.ranged & (good > 0))
     probability = weigh_types(last, agreed, noise, inflation, lost).probability
     return last[max(probability, key=probability.get)], probability, noise
+
+
+def _holds(screw: State, kind: str, obs: Observations, noise: Noise, inflation: float) -> bool:
+    """Whether the simpler type, started from the screw, comes near enough to it for a closer look."""
+    _, least = refine(screw, obs, noise, 3.0, iterations=4, tolerance=1e-3)
+    _, cost = refine(_as_kind(screw, kind), obs, noise, 3.0, iterations=4, tolerance=1e-3)
+    return cost <= least + HOPELESS * inflation
 
 
 def _polish(st: State, obs: Observations, noise: Noise) -> tuple[State, Observations, Noise]:
