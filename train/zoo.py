@@ -121,7 +121,8 @@ def page(entries: Sequence[Entry], command: str, figure: str | None, film: str |
                   "*Dots: evaluations without noise, in episodes that are not the table's: the first is the replay, "
                   "the second the policy after its guide's lessons (nothing is evaluated in between), and one that "
                   "is `enough` ends the training. Lines: with the noise that training explores with, over 100 "
-                  "episodes (each counted once all that began with it have ended). Dashed: the replay in the table's episodes.*", ""]
+                  "episodes (each counted once all that began with it have ended). Dashed: the replay in the table's "
+                  "episodes.*", ""]
     if film is not None:
         lines += [f"![Every asset: a policy and the replay in one episode.]({film})", "",
                   f"*The first seed's policy (left) beside the open-loop replay (right), in the table's first episode, "
