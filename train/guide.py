@@ -49,8 +49,7 @@ class Way(NamedTuple):
 # less, one that goes after the link goes on driving it, and one that waits for a heavy link keeps hold of it. A hand
 # that reaches further in than the person's does not slip off a lid's edge when it errs. What is best depends on the
 # joint.
-WAYS = (Way(0.01, 0.05, pace=-0.15, inward=0.03), Way(-0.02, 0.05, 0.7, -0.3, inward=0.03),
-        Way(-0.02, 0.04, 0.5, -0.3, True, inward=0.02),
+WAYS = (Way(0.01, 0.05, pace=-0.15, inward=0.03), Way(-0.02, 0.04, 0.5, -0.3, True, inward=0.02),
         Way(-0.04, 0.03, 0.5, -0.5, True, foresee=0.2, wait=0.06))  # fmt: skip
 LEAD = 0.6  # s
 STAND = -2 / 3  # action at which the reference's clock stands

@@ -100,7 +100,7 @@ def summary(entries: Sequence[Entry]) -> str:
     short = {i: rate for i, rate in sorted(rates.items(), key=lambda item: item[1]) if rate < GOAL}
     gains = [100 * (rates[e.asset.id] - e.pooled("replay")[0]) for e in entries if e.pooled("replay")[0] < POOR]
     text = f"{len(rates) - len(short)} of {len(rates)} assets reach {GOAL:.0%}"
-    text += "; " + ", ".join(f"{i} {rate:.0%}" for i, rate in short.items()) + "." if short else "."
+    text += "; " + ", ".join(f"{i} {rate:.1%}" for i, rate in short.items()) + "." if short else "."
     if gains:
         text += (f" Where the replay succeeds in less than {POOR:.0%} ({len(gains)} of them) the policy is "
                  f"{min(gains):.0f} to {max(gains):.0f} points above it.")
