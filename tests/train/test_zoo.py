@@ -27,7 +27,8 @@ def test_seeds_are_pooled_and_shown(door: Asset) -> None:
 def test_the_summary_counts_every_asset_and_names_those_that_fall_short(door: Asset) -> None:
     other = replace(door, id="lid")
     said = zoo.summary([zoo.Entry(door, [run_of(0.94, 0.5)], []), zoo.Entry(other, [run_of(0.95, 0.8)], [])])
-    assert said.startswith(f"1 of 2 assets reach 95%; {door.id} 94.0%.") and "(1 of them) the policy is 44 to 44" in said
+    assert said.startswith(f"1 of 2 assets reach 95%; {door.id} 94.0%.")
+    assert "(1 of them) the policy is 44 to 44" in said
 
 
 @pytest.mark.slow
