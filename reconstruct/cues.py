@@ -74,12 +74,18 @@ class Tracks:
         uv: (N, T, 2) full px (NaN where not visible).
         visible: (N, T) bool.
         reference: (N,) working frame in which each track was seeded.
+        slip: (N, T, 2) along the direction in which the picture holds the point worst (an edge's own), its square
+            1 - s, where s is the noise across over the noise along: 0 at corners, near 1 on edges, where a point
+            slides. None where nothing is known of it.
+        shade: (N,) bool, on an edge whose two sides differ in brightness alone, as a shadow's do. None as before.
     """
 
     uv: np.ndarray
     visible: np.ndarray
     reference: np.ndarray
     provider: ProviderInfo
+    slip: np.ndarray | None = None
+    shade: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -236,14 +236,21 @@ def booleans(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.
 
 
 def tracks_from_cue(cue: Arrays, frames: int, maker: ProviderInfo = GIVEN) -> Tracks:
-    """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T)); seeded where first visible."""
+    """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T), optional slip (N, T, 2) and shade (N,) as in
+    :class:`Tracks`); seeded where first visible."""
     uv = numbers(cue["uv"], (None, frames, 2), "uv of cues/tracks.npz")
     if not len(uv):
         raise TaaError("cues/tracks.npz holds no track; remove it and the pipeline tracks points itself")
     visible = booleans(cue["visible"], uv.shape[:2], "visible of cues/tracks.npz")
     visible = visible & (np.abs(np.nan_to_num(uv, nan=np.inf)) < MAX_PX).all(-1)
     uv = np.where(visible[..., None], uv, np.nan)
-    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), maker)
+    slip = None
+    if "slip" in cue:
+        slip = np.nan_to_num(numbers(cue["slip"], uv.shape, "slip of cues/tracks.npz")).astype(np.float32)
+        if (np.linalg.norm(slip, axis=-1) > 1 + 1e-3).any():
+            raise TaaError("slip of cues/tracks.npz is longer than 1; its square is the share that is not held")
+    shade = booleans(cue["shade"], uv.shape[:1], "shade of cues/tracks.npz") if "shade" in cue else None
+    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), maker, slip, shade)
 
 
 def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.ndarray | None,
@@ -534,4 +541,5 @@ def mask_arrays(masks: LinkMasks) -> dict[str, np.ndarray]:
 
 def track_arrays(tracks: Tracks) -> dict[str, np.ndarray]:
     """``tracks.npz``."""
-    return {"uv": tracks.uv, "visible": tracks.visible}
+    more = {"slip": tracks.slip, "shade": tracks.shade}
+    return {"uv": tracks.uv, "visible": tracks.visible, **{k: v for k, v in more.items() if v is not None}}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.articulation.bound import Bound
-from benchmarks.articulation.motions import SIZE
+from benchmarks.articulation.motions import SIZE, pixel_rays
 from benchmarks.articulation.noise import Given
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.models import JointFit
@@ -93,7 +93,7 @@ def _without_depth(given: Given, focal_known: bool, seed: int) -> JointFit:
     T = given.uv.shape[1]
     blank = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
     video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, blank, 1.0)
-    tracks = Tracks(given.uv.astype(np.float32), given.visible, given.scene.seed, PROVIDER)
+    tracks = Tracks(given.uv.astype(np.float32), given.visible, given.scene.seed, PROVIDER, given.slip, given.shade)
     focal = float(given.scene.shot.K[0, 0]) if focal_known else None
     if given.hands is not None:
         return joint_off_the_arm(video, tracks, given.hands, focal, seed, lambda _: None)
@@ -103,14 +103,17 @@ def _without_depth(given: Given, focal_known: bool, seed: int) -> JointFit:
 def _registration(fit: JointFit, given: Given, best: Bound | None) -> tuple[float, np.ndarray] | None:
     """Scale and pose that take a fit up to scale into the true world: both see the same first camera.
 
-    The scale is the weighted median ratio of depths, true over fitted, of the moving points of the fit;
-    None if it has no point that is right.
+    The scale is the weighted median ratio of depths, true over fitted, of the moving points of the fit, in row 4 of
+    the link's surface where these were seeded; None if it has no point that is right.
     """
     shot, scene = given.scene.shot, given.scene
     T_world_camera = shot.T_world_camera[0]
     T_camera_fit = np.asarray(fit.T_camera_world, float)
     ratio, weight = np.ones(1), np.ones(1)
-    if fit.points is not None and fit.point_track is not None:
+    if fit.points is not None and fit.point_track is not None and given.row == 4:
+        ratio = _ratios_at_seeds(fit, given)
+        weight = np.ones(len(ratio))
+    elif fit.points is not None and fit.point_track is not None:
         ids = np.asarray(fit.point_track, int)
         on = scene.moving[ids] & ~given.wrong[ids].any(1)
         ids, points = ids[on], fit.points[on]
@@ -130,6 +133,34 @@ def _registration(fit: JointFit, given: Given, best: Bound | None) -> tuple[floa
     out[:3, :3] = T_world_camera[:3, :3] @ T_camera_fit[:3, :3]
     out[:3, 3] = scale * T_world_camera[:3, :3] @ T_camera_fit[:3, 3] + T_world_camera[:3, 3]
     return scale, out
+
+
+RIM_PX = 2.0
+"""How far beside the link the seed of a point on its rim may lie."""
+
+
+def _ratios_at_seeds(fit: JointFit, given: Given) -> np.ndarray:
+    """(m,) depths of the link's surface over those of the fit's points, where and when their tracks were seeded.
+
+    A point on an edge may slide along it afterwards, and half of those on a rim are seeded beside it.
+    """
+    shot, model = given.scene.shot, given.scene.model
+    ids = np.asarray(fit.point_track, int)
+    frame = given.scene.seed[ids]
+    T_fit, T_camera = fit.link_pose(_all_frames(fit, len(shot.q))[frame]), np.asarray(fit.T_camera_world, float)
+    world = np.einsum("nij,nj->ni", T_fit[:, :3, :3], fit.points) + T_fit[:, :3, 3]
+    z_fit, z_true = world @ T_camera[2, :3] + T_camera[2, 3], np.full(len(ids), np.nan)
+    turns = np.arange(8) * np.pi / 4
+    beside = np.concatenate([np.zeros((1, 2)), RIM_PX * np.stack([np.cos(turns), np.sin(turns)], axis=1)])
+    for f in np.unique(frame):
+        rows, camera = np.flatnonzero(frame == f), shot.T_world_camera[f]
+        rays = pixel_rays(given.uv[ids[rows], f][:, None] + beside, shot.K, camera)
+        distance, geom = model.cast(float(shot.q[f]), camera[:3, 3], rays.reshape(-1, 3))
+        on = ((geom >= 0) & model.moving_geoms[geom]).reshape(len(rows), -1)
+        depth = (distance.reshape(on.shape) * (rays @ camera[:3, 2]))[np.arange(len(rows)), on.argmax(1)]
+        z_true[rows] = np.where(on.any(1), depth, np.nan)
+    ratio = z_true / z_fit
+    return ratio[np.isfinite(ratio) & (ratio > 0)]
 
 
 def _all_frames(fit: JointFit, T: int) -> np.ndarray:

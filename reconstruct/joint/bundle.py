@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.hypotheses import perpendicular_basis
+from reconstruct.joint.paths import held
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Observations:
         weight: (N,) weight of each track.
         px: ray units per working px (1 / focal in working px).
         frames: (K,) frame numbers.
+        slip: (N, K, 2) along what the picture holds badly, see paths.py; None if there is none.
     """
 
     xy: np.ndarray
@@ -35,6 +37,13 @@ class Observations:
     weight: np.ndarray
     px: float
     frames: np.ndarray
+    slip: np.ndarray | None = None
+
+    def of(self, tracks: np.ndarray) -> Observations:
+        """Of some of the tracks."""
+        slip = None if self.slip is None else self.slip[tracks]
+        return replace(self, xy=self.xy[tracks], seen=self.seen[tracks], ref=self.ref[tracks],
+                       weight=self.weight[tracks], slip=slip)  # fmt: skip
 
     @property
     def ref_rays(self) -> np.ndarray:
@@ -89,9 +98,9 @@ def transport(s: State, obs: Observations) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reprojection(X: np.ndarray, obs: Observations) -> np.ndarray:
-    """(N, K, 2) residuals in working px, 0 where not seen."""
+    """(N, K, 2) residuals in working px, as far as the picture holds them; 0 where not seen."""
     z = np.maximum(X[..., 2:], 1e-3)
-    r = (X[..., :2] / z - obs.xy) / obs.px
+    r = held((X[..., :2] / z - obs.xy) / obs.px, obs.slip)
     behind = X[..., 2] < 1e-3
     r = np.where(behind[..., None], 1e3, r)
     return np.where(obs.seen[..., None], r, 0.0)
@@ -104,8 +113,8 @@ def solve_depths(s: State, obs: Observations, sweeps: int = 2, scale: float = 4.
     C = X1 - D  # X = depth * D + C
     xy = obs.xy
     # x * (depth Dz + Cz) = depth Dx + Cx, and the same for y
-    A = D[..., :2] - xy * D[..., 2:]
-    b = xy * C[..., 2:] - C[..., :2]
+    A = held(D[..., :2] - xy * D[..., 2:], obs.slip)
+    b = held(xy * C[..., 2:] - C[..., :2], obs.slip)
     w = obs.seen.astype(float)
     lam = np.ones(len(obs.ref))
     for k in range(sweeps + 1):
@@ -213,7 +222,7 @@ def normal_equations(s: State, obs: Observations, X, D, r, w):
     z = np.maximum(X[..., 2], 1e-3)
 
     def image(dX: np.ndarray) -> np.ndarray:  # (N, K, 3) -> (N, K, 2) px
-        return (dX[..., :2] - X[..., :2] / z[..., None] * dX[..., 2:]) / z[..., None] / obs.px
+        return held((dX[..., :2] - X[..., :2] / z[..., None] * dX[..., 2:]) / z[..., None] / obs.px, obs.slip)
 
     Jl = image(D)
     if s.kind == "prismatic":

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reconstruct.joint.bundle import Observations, State, reprojection, transport
 from reconstruct.joint.groups import adjust
+from reconstruct.joint.paths import held
 from reconstruct.joint.polish import Bundle, Sightings, noise, residuals
 from reconstruct.joint.select import explained, explained_by
 
@@ -37,7 +38,7 @@ def bridged(b: Bundle, s: Sightings) -> Bridged:
     """
     path = np.concatenate([[0], np.cumsum(np.abs(np.diff(b.q)))])
     cuts = np.unique(np.searchsorted(path, np.linspace(0, path[-1], STEPS + 1)).clip(0, len(path) - 1))
-    predicted = s.uv + residuals(b, s)
+    predicted = s.uv + residuals(b, replace(s, slip=None))
     errors, lengths = [], []
     for k, m in zip(cuts[:-1], cuts[1:], strict=True):
         both = s.seen[:, k] & s.seen[:, m]
@@ -45,8 +46,9 @@ def bridged(b: Bundle, s: Sightings) -> Bridged:
             errors.append(np.nan)
             lengths.append(path[m] - path[k])
             continue
-        moved = s.uv[both, m] - s.uv[both, k]
-        wrong = predicted[both, m] - predicted[both, k] - moved
+        along = None if s.slip is None else s.slip[both, m]
+        moved = held(s.uv[both, m] - s.uv[both, k], along)
+        wrong = held(predicted[both, m] - predicted[both, k], along) - moved
         size = np.linalg.norm(moved, axis=-1)
         far = size >= np.median(size)
         # Two noisy ends miss each other by 1.7 standard deviations in the median.
@@ -92,7 +94,8 @@ def looser(b: Bundle, s: Sightings) -> float | None:
         R, t = s.R[some] @ R, np.einsum("tij,tj->ti", s.R[some], t) + s.t[some]
     on_joint = np.where(seen[..., None], residuals(b, s)[ids][:, some], 0.0)
     x = np.where(seen[..., None], s.uv[ids][:, some], np.nan) / focal
-    _, _, _, free = adjust(x, seen, R, t, b.X[ids], focal, iterations=25)
+    slip = None if s.slip is None else s.slip[ids][:, some]
+    _, _, _, free = adjust(x, seen, R, t, b.X[ids], focal, iterations=25, slip=slip)
     fair = np.sqrt(numbers / (numbers - unknown))
     return float(noise(on_joint, seen) / max(free * fair, 1e-6))
 
@@ -169,7 +172,8 @@ def _free_residuals(P: np.ndarray, poses: list, obs: Observations) -> np.ndarray
     for k, pose in enumerate(poses):
         if pose is not None:
             proj, _ = cv2.projectPoints(P, *pose, np.eye(3), None)
-            free[:, k] = np.linalg.norm(proj[:, 0] - obs.xy[:, k], axis=-1) / obs.px
+            off = held(proj[:, 0] - obs.xy[:, k], None if obs.slip is None else obs.slip[:, k])
+            free[:, k] = np.linalg.norm(off, axis=-1) / obs.px
     return free
 
 

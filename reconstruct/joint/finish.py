@@ -12,6 +12,7 @@ from scipy.special import expit
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.cameras import before_the_link, rougher
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities, tempered, votes
+from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
     Bundle,
@@ -149,13 +150,13 @@ class View:
     t: np.ndarray | None = None
     restless: float = 0.0
 
-    def sightings(self, uv: np.ndarray, frames: np.ndarray, lasting: float = 1.0) -> Sightings:
-        """Of tracks (n, T, 2) in some frames."""
-        uv = uv[:, frames]
-        seen = np.isfinite(uv[..., 0])
+    def sightings(self, paths: Paths, frames: np.ndarray, lasting: float = 1.0) -> Sightings:
+        """Of tracks in some frames."""
+        some = paths.at(frames)
+        seen = some.seen
         R, t = (None, None) if self.R is None else (self.R[frames], self.t[frames])
-        return Sightings(np.where(seen[..., None], uv, 0.0), seen, np.ones(len(uv)), self.focal, self.focal_std, R, t,
-                         frames, lasting)  # fmt: skip
+        return Sightings(np.where(seen[..., None], some.uv, 0.0), seen, np.ones(len(some)), self.focal, self.focal_std,
+                         R, t, frames, lasting, slip=some.slip)  # fmt: skip
 
     def corrected(self, b: Bundle, some: np.ndarray) -> View:
         """The camera's path as a bundle adjustment of some frames found it, interpolated between them."""
@@ -173,23 +174,23 @@ class View:
 Starts = Mapping[str, Sequence[tuple[State, Observations] | Bundle]]
 
 
-def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: Still | None = None) -> Finished:
+def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Still | None = None) -> Finished:
     """Polish every type on the same tracks and decide between them.
 
     Args:
         starts: per type, states with depths of the tracks `ids` and their key-frame observations, or bundles of these
             tracks in all frames. The one that fits best after polishing counts.
-        uv: (N, T, 2) px from the principal point, NaN where not seen.
+        paths: N tracks, px from the principal point.
         ids: (n,) tracks that the answer is fitted to.
         view: focal length and camera.
         still: the resting scene, where the camera moves and its path in `view` is but an estimate: it is refined
             together with the joint, whose uncertainty then holds the camera's.
     """
-    T = uv.shape[1]
+    T = paths.uv.shape[1]
     some = _spread_out(T, MOST_FRAMES if still is None else COARSE_FRAMES)
     pick = _spread_out(len(ids), MOST_TRACKS)
     # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
-    sight = view.sightings(uv[ids[pick]], some, lasting=100.0)
+    sight = view.sightings(paths[ids[pick]], some, lasting=100.0)
     best: dict[str, Bundle] = {}
     others: dict[str, list[Bundle]] = {}
     for kind, several in starts.items():
@@ -206,12 +207,12 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     if keep.sum() < max(MIN_COMMON, 0.8 * max(s.sum() for s in sane)):
         keep = sane[int(np.argmin([b.cost for b in best.values()]))]
     members = ids[pick[keep]]
-    sight = replace(sight, uv=sight.uv[keep], seen=sight.seen[keep], weight=sight.weight[keep])
+    sight = sight.of(keep)
     best = {kind: replace(b, X=b.X[keep]) for kind, b in best.items()}
     if still is None:
         best = {kind: polish(b, sight) for kind, b in best.items()}
     else:
-        best, sight = _together(_across_kinds(best, sight), sight, uv, still, view)
+        best, sight = _together(_across_kinds(best, sight), sight, paths, still, view)
     sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
     probability = type_probabilities(best, sight)
@@ -220,24 +221,24 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
 
     # Now that the motion is known, on all frames whatever follows it joins in, and the types are weighed on all of it.
     kind = _winner(probability)
-    best, members, still, view = _on_all_frames(best, kind, sight, uv, members, still, view)
+    best, members, still, view = _on_all_frames(best, kind, sight, paths, members, still, view)
     some = _spread_out(T, MOST_FRAMES if still is None else FREE_FRAMES)
     best = {k: replace(b, q=b.q[some] - b.q[some[0]]) for k, b in best.items()}
     lead = best[kind]
     # Errors last as long as in the first round, in frames of this one.
-    like = view.sightings(uv[members], some, max(1.0, sight.lasting * len(some) / len(sight.frames)))
-    more, X = followers(lead, uv, np.setdiff1d(np.arange(len(uv)), members), view, like)
+    like = view.sightings(paths[members], some, max(1.0, sight.lasting * len(some) / len(sight.frames)))
+    more, X = followers(lead, paths, np.setdiff1d(np.arange(len(paths)), members), view, like)
     members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
-    sight = view.sightings(uv[members], some, lasting=100.0)
+    sight = view.sightings(paths[members], some, lasting=100.0)
     bound = _spread_out(len(members), MOST_TRACKS)
-    few = replace(sight, uv=sight.uv[bound], seen=sight.seen[bound], weight=sight.weight[bound])
+    few = sight.of(bound)
     best = {k: place_points(replace(b, X=X[bound]), few) for k, b in best.items()}
     if still is None:
         best = {k: polish(b, few, iterations=30) for k, b in best.items()}
     else:
         apart = ~np.isin(still.ids, members)
         rest = replace(still, ids=still.ids[apart], X=still.X[apart])
-        best, few = _together(best, few, uv, rest, view)
+        best, few = _together(best, few, paths, rest, view)
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
     near: list[Bundle] = []
@@ -256,7 +257,7 @@ def finish(starts: Starts, uv: np.ndarray, ids: np.ndarray, view: View, still: S
     sight = replace(sight, weight=np.interp(np.arange(len(members)), bound, weight), lasting=few.lasting)
     sight.seen[bound] = few.seen[: len(bound)]
     b = place_points(replace(last, X=X), sight, rounds=4) if len(bound) < len(members) else last
-    every = replace(view.sightings(uv[members], np.arange(T), few.lasting), weight=sight.weight)
+    every = replace(view.sightings(paths[members], np.arange(T), few.lasting), weight=sight.weight)
     if len(some) < T:
         b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
@@ -299,10 +300,10 @@ def _spread_out(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: Still, view: View):
+def _together(best: dict[str, Bundle], sight: Sightings, paths: Paths, still: Still, view: View):
     """Joint and camera in one bundle adjustment: the bundles with the scene's points and poses, and its sightings."""
     pick = _spread_out(len(still.ids), MOST_STILL)
-    scene = view.sightings(uv[still.ids[pick]], sight.frames)
+    scene = view.sightings(paths[still.ids[pick]], sight.frames)
     relative = np.ones(len(sight.uv) + len(pick))
     if still.sigma is not None:
         moving = max(min(b.sigma for b in best.values()), 0.05)
@@ -312,6 +313,7 @@ def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: 
         uv=np.concatenate([sight.uv, scene.uv]),
         seen=np.concatenate([sight.seen, scene.seen]),
         weight=np.concatenate([sight.weight, scene.weight]),
+        slip=None if sight.slip is None else np.concatenate([sight.slip, scene.slip]),
         link=np.arange(len(sight.uv) + len(pick)) < len(sight.uv),
         relative=relative,
         free=True,
@@ -320,7 +322,7 @@ def _together(best: dict[str, Bundle], sight: Sightings, uv: np.ndarray, still: 
     return {k: polish(b, both) for k, b in start.items()}, both
 
 
-def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, uv: np.ndarray, members: np.ndarray,
+def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, paths: Paths, members: np.ndarray,
                    still: Still | None, view: View):  # fmt: skip
     """From the first round's frames to all, before the camera found so far: the link alone, its tracks, scene and view.
 
@@ -329,7 +331,7 @@ def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, uv: np.
     """
     every = view if still is None else view.corrected(best[kind], sight.frames)
     link = np.ones(len(sight.uv), bool) if sight.link is None else sight.link
-    seen = every.sightings(uv[members], np.arange(uv.shape[1]))
+    seen = every.sightings(paths[members], np.arange(paths.uv.shape[1]))
     out = {
         k: states_of_all_frames(replace(b, X=b.X[link], R=None, t=None), seen, sight.frames) for k, b in best.items()
     }
@@ -354,12 +356,12 @@ SURE = 20.0
 
 
 def followers(
-    b: Bundle, uv: np.ndarray, ids: np.ndarray, view: View, like: Sightings, most: int = 800
+    b: Bundle, paths: Paths, ids: np.ndarray, view: View, like: Sightings, most: int = 800
 ) -> tuple[np.ndarray, np.ndarray]:
     """Further tracks that move with the link rather than rest, however little: those near the axis hold it best.
 
     Args:
-        b: the fitted joint.  uv: (N, T, 2) of all tracks.  ids: (m,) those to look at.
+        b: the fitted joint.  paths: all tracks.  ids: (m,) those to look at.
         view: focal length and camera.  like: the fit's observations, for frames and noise.
 
     Returns:
@@ -367,19 +369,21 @@ def followers(
     """
     sigma = max(b.sigma, 0.05)
     extent = np.full(len(ids), 0.0)
-    some = np.isfinite(uv[ids][:, like.frames, 0]).sum(1) >= 4
-    extent[some] = np.linalg.norm(np.nanmax(uv[ids[some]], axis=1) - np.nanmin(uv[ids[some]], axis=1), axis=-1)
+    some = paths[ids].at(like.frames).seen.sum(1) >= 4
+    uv = paths.uv[ids[some]]
+    extent[some] = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)
     ids = ids[extent > 8 * sigma]
     if not len(ids):
         return ids, np.zeros((0, 3))
     if len(ids) > most:
         ids = ids[np.linspace(0, len(ids) - 1, most).round().astype(int)]
-    s = view.sightings(uv[ids], like.frames, like.lasting)
+    s = view.sightings(paths[ids], like.frames, like.lasting)
     own = len(b.X)
     trial = place_points(replace(b, X=np.tile(np.median(b.X, axis=0), (len(ids), 1))), s)
     r = residuals(trial, s)
     if view.R is None:
-        rest = np.where(s.seen[..., None], s.uv - np.nanmedian(uv[ids][:, like.frames], axis=1)[:, None], 0.0)
+        middle = np.nanmedian(np.where(s.seen[..., None], s.uv, np.nan), axis=1)[:, None]
+        rest = held(np.where(s.seen[..., None], s.uv - middle, 0.0), s.slip)
     else:
         resting = replace(b, q=np.zeros_like(b.q), X=trial.X)
         rest = residuals(place_points(resting, s), s)

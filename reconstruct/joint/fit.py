@@ -15,7 +15,8 @@ from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Starts, Still, Vi
 from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
-from reconstruct.joint.polish import positions, residuals
+from reconstruct.joint.paths import Paths, held
+from reconstruct.joint.polish import Bundle, Sightings, positions, residuals
 from reconstruct.joint.select import (
     distinct,
     explained,
@@ -58,6 +59,9 @@ FREE_SHARE = 1 / 4
 and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0 to 0.15; what is lifted away leaves
 0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
 
+SLID_PX = 2.0
+"""Working px, median, that a track may have slid along its edge for its point to be handed on."""
+
 TRIES = 3
 """Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
 nothing better than that."""
@@ -89,21 +93,21 @@ def fit_joint(
     """
     rng = np.random.default_rng(seed)
     tell = progress or (lambda _: None)
-    uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
+    paths = _paths(video, tracks)
     h, w = video.frames.shape[1:3]
     known = focal_px or video.focal_px
     full = known or DEFAULT_FOCAL * max(video.size)
     camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
     view = View(camera.focal, 0.0 if known else PRIOR_STD)
-    if camera_moving or (camera_moving is None and camera_moves(uv, camera.diagonal)):
-        fit = _moving_camera(video, uv - camera.centre, view, full, len(uv), seed)
+    if camera_moving or (camera_moving is None and camera_moves(paths.uv, camera.diagonal)):
+        fit = _moving_camera(video, paths - camera.centre, view, full, seed)
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
-            return fit or JointFit("refused", NO_SCENE, tracks=len(uv))
+            return fit or JointFit("refused", NO_SCENE, tracks=len(paths))
     answer, most = None, 0.0
     for k in range(TRIES):
-        fit, worth = _one_draw(video, uv, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
+        fit, worth = _one_draw(video, paths, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
         # Asked often enough something may pass for a joint: a later draw has to explain what the others missed.
         if fit.verdict != "refused" and worth > LUCKIER * most:
             answer = fit
@@ -116,75 +120,76 @@ def fit_joint(
     return answer
 
 
-def _one_draw(video: Video, uv: np.ndarray, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
+def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
               tell: Callable[[float], None]) -> tuple[JointFit, float]:  # fmt: skip
     """The joint before a camera that rests or is held in a hand, by one draw of hypotheses, and the motion it explains.
 
     Args:
-        uv: (N, T, 2) working px.
+        paths: of all tracks, working px.
         known: focal length in full px, None where the prior's mean is taken.
     """
     note = ""
-    found = _consensus(uv, camera, rng, lambda x: tell(0.85 * x))
+    found = _consensus(paths, camera, rng, lambda x: tell(0.85 * x))
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
-        stretches = motion_stretches(uv[_moving(uv, camera.diagonal)], video.time)
+        stretches = motion_stretches(paths.uv[_moving(paths, camera.diagonal)], video.time)
         tries = [
-            _consensus(_only(uv, span), camera, rng, lambda _: None) for span in stretches[:3] if len(stretches) > 1
+            _consensus(_only(paths, span), camera, rng, lambda _: None) for span in stretches[:3] if len(stretches) > 1
         ]
         tries = [t for t in tries if not t.refusal]
         if tries:
             found = max(tries, key=lambda t: t.explained)
             note = f"; no joint explains the whole video: the dominant of {len(stretches)} stretches of motion is taken"
     if found.refusal:
-        return JointFit("refused", found.refusal, tracks=len(uv), inliers=len(found.members)), found.explained
+        return JointFit("refused", found.refusal, tracks=len(paths), inliers=len(found.members)), found.explained
     tell(0.9)
     if video.warp is None:
-        restless = _restlessness(uv, camera, 0.5)
-        starts, members = _sharpened(found, uv - camera.centre, view, camera)
-        done = finish(starts, uv - camera.centre, members, view)
+        restless = _restlessness(paths, camera, 0.5)
+        starts, members = _sharpened(found, paths - camera.centre, view, camera)
+        done = finish(starts, paths - camera.centre, members, view)
     else:
-        done, restless, words = _hand_held(found, uv, video.warp, view, camera)
+        done, restless, words = _hand_held(found, paths, video.warp, view, camera)
         note += words
     if reason := _why_not_believed(done, restless):
-        return JointFit("refused", reason, tracks=len(uv), inliers=len(done.members)), found.explained
+        return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members)), found.explained
     full = camera.focal / video.scale
-    return _result(video, done, full, len(uv), note, KNOWN_STD if known else None), found.explained
+    return _result(video, done, full, len(paths), note, KNOWN_STD if known else None), found.explained
 
 
-def _sharpened(found: _Consensus, uv: np.ndarray, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:
+def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:
     """Starts and tracks for the end: the search's own, or where the motion is small those of a sweep.
 
     Args:
-        uv: (N, T, 2) px from the principal point.
+        paths: of all tracks, px from the principal point.
     """
     if found.obs is None or np.ptp(global_profile(found.obs)) / found.obs.px > SMALL * camera.diagonal:
         return found.starts, found.members
     rivals = [bundle_of_state(*s, found.obs.frames) for several in found.starts.values() for s in several]
-    swept = sweep(uv, found.moving, found.obs, found.members, rivals, view)
+    swept = sweep(paths, found.moving, found.obs, found.members, rivals, view)
     return (found.starts, found.members) if swept is None else (swept.starts, swept.ids)
 
 
-def _hand_held(found: _Consensus, uv: np.ndarray, warp: np.ndarray, view: View, camera: _Camera
+def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, camera: _Camera
                ) -> tuple[Finished, float, str]:  # fmt: skip
     """The joint before a camera held in a hand, whose path is fitted with it where enough of the scene rests.
 
     Args:
-        uv: (N, T, 2) working px in the compensated picture.  warp: (T, 3, 3) as in :class:`Video`.
+        paths: of all tracks, working px in the compensated picture.  warp: (T, 3, 3) as in :class:`Video`.
 
     Returns:
         The joint, by how much points at rest miss their place, px, and words for the result.
     """
-    still, filmed_uv = uv - camera.centre, filmed(uv, warp) - camera.centre
-    rest = np.setdiff1d(np.arange(len(uv)), np.concatenate([_moving(uv, camera.diagonal), found.members]))
-    path = path_from_rest(filmed_uv, still, rest, camera.focal)
+    # The picture's warp hardly turns edges.
+    still, as_filmed = paths - camera.centre, replace(paths, uv=filmed(paths.uv, warp)) - camera.centre
+    rest = np.setdiff1d(np.arange(len(paths)), np.concatenate([_moving(paths, camera.diagonal), found.members]))
+    path = path_from_rest(as_filmed.uv, still.uv, rest, camera.focal)
     if path is None:
-        restless = _restlessness(uv, camera, DEPTHS)
+        restless = _restlessness(paths, camera, DEPTHS)
         view = replace(view, restless=restless if np.isfinite(restless) else 0.0)
         return finish(found.starts, still, found.members, view), restless, "; the camera moves: taken to its first view"
     leading = next(iter(found.starts.values()))[0]
-    view, scene = scaled_to_link(path, leading, filmed_uv, found.members, view)
-    done = finish(found.starts, filmed_uv, found.members, view, scene)
+    view, scene = scaled_to_link(path, leading, as_filmed, found.members, view)
+    done = finish(found.starts, as_filmed, found.members, view, scene)
     return done, path.sigma, "; the camera moves: its path is fitted together with the joint"
 
 
@@ -219,40 +224,47 @@ class _Consensus:
     moving: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
-def _moving(uv: np.ndarray, diagonal: float) -> np.ndarray:
-    """(k,) indices of the tracks (N, T, 2) that leave their place; working px."""
-    extent = np.zeros(len(uv))
-    some = np.isfinite(uv[..., 0]).sum(1) > 1
+def _paths(video: Video, tracks: Tracks) -> Paths:
+    """The tracks in working px."""
+    return Paths(video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan)), tracks.slip)
+
+
+def _moving(paths: Paths, diagonal: float) -> np.ndarray:
+    """(k,) indices of the tracks that leave their place; working px."""
+    extent = np.zeros(len(paths))
+    some = paths.seen.sum(1) > 1
     if some.any():
-        extent[some] = np.linalg.norm(np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1), axis=-1)
+        # Sliding along an edge included: taken out, half of a moving part's tracks would not count as moving.
+        uv = paths.uv[some]
+        extent[some] = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)
     return np.flatnonzero(extent > MOVING_SHARE * diagonal)
 
 
 def moving_tracks(video: Video, tracks: Tracks) -> np.ndarray:
     """(k,) indices of the tracks whose extent exceeds :data:`MOVING_SHARE` of the image diagonal."""
-    uv = video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan))
     h, w = video.frames.shape[1:3]
-    return _moving(uv, float(np.hypot(h, w)))
+    return _moving(_paths(video, tracks), float(np.hypot(h, w)))
 
 
-def _restlessness(uv: np.ndarray, camera: _Camera, share: float) -> float:
+def _restlessness(paths: Paths, camera: _Camera, share: float) -> float:
     """Working px, RMS, by which a share of the tracks at rest leave their place at most; infinite if there are none."""
-    rest = np.setdiff1d(np.flatnonzero(np.isfinite(uv[..., 0]).mean(1) > 0.5), _moving(uv, camera.diagonal))
+    rest = np.setdiff1d(np.flatnonzero(paths.seen.mean(1) > 0.5), _moving(paths, camera.diagonal))
     if not len(rest):
         return np.inf
-    off = uv[rest] - np.nanmedian(uv[rest], axis=1)[:, None]
+    some = paths[rest]
+    off = held(some.uv - np.nanmedian(some.uv, axis=1)[:, None], some.slip)
     return float(np.quantile(np.sqrt(np.nanmean(off**2, axis=(1, 2))), share))
 
 
-def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:
-    moving = _moving(uv, camera.diagonal)
+def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:
+    moving = _moving(paths, camera.diagonal)
     if len(moving) < MIN_INLIERS:
-        return _Consensus(refusal=f"nothing moves: {len(moving)} of {len(uv)} tracks leave their place")
-    keys = key_frames(uv[moving])
+        return _Consensus(refusal=f"nothing moves: {len(moving)} of {len(paths)} tracks leave their place")
+    keys = key_frames(paths.uv[moving])
     if len(keys) < 6:
         return _Consensus(refusal="the motion is too short: fewer than six distinct states")
     focal, centre, diagonal = camera.focal, camera.centre, camera.diagonal
-    obs, _ = observations(uv[moving], focal, centre, keys, 260, rng, diagonal)
+    obs, _ = observations(paths[moving], focal, centre, keys, 260, rng, diagonal)
     if len(obs.ref) < MIN_INLIERS:
         return _Consensus(refusal=f"only {len(obs.ref)} moving tracks last long enough")
     ranked = search(obs, rng, progress=lambda x: tell(0.9 * x))
@@ -264,15 +276,14 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
     # The hinge contains the slide: it has to explain clearly more to name the tracks of the link.
     worth = {kind: explained(s, obs)[0] * (SIMPLER if kind == "prismatic" else 1.0) for kind, s in best.items()}
     # All moving tracks, not just the sample of the search, for the consensus set.
-    every, ids = observations(uv[moving], focal, centre, keys, 900, rng, diagonal)
+    every, ids = observations(paths[moving], focal, centre, keys, 900, rng, diagonal)
     first: _Consensus | None = None
     for kind in sorted(best, key=lambda kind: -worth[kind]):
         # There is no joint only if every type is refuted.
         s = refine(_redepth(best[kind], every), every, scales=(3.0, 2.0), iterations=8)
         total, share = explained(s, every)
         follows = share > 0.5
-        link = Observations(every.xy[follows], every.seen[follows], every.ref[follows], every.weight[follows], every.px,
-                            every.frames)  # fmt: skip
+        link = every.of(follows)
         starts = {kind: [(replace(s, depth=s.depth[follows]), link)]}
         starts |= {k: [(_redepth(b, link), link)] for k, b in best.items() if k != kind}
         # Hinges that lean to either side of the viewing ray may explain nearly the same: the last digits tell.
@@ -288,11 +299,11 @@ def _consensus(uv: np.ndarray, camera: _Camera, rng: np.random.Generator, tell: 
     return first
 
 
-def _only(uv: np.ndarray, span: slice) -> np.ndarray:
+def _only(paths: Paths, span: slice) -> Paths:
     """Tracks as seen in some frames only."""
-    out = np.full_like(uv, np.nan)
-    out[:, span] = uv[:, span]
-    return out
+    uv = np.full_like(paths.uv, np.nan)
+    uv[:, span] = paths.uv[:, span]
+    return replace(paths, uv=uv)
 
 
 def _redepth(s: State, obs: Observations) -> State:
@@ -313,23 +324,23 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     return None
 
 
-def _moving_camera(video: Video, uv: np.ndarray, view: View, full_focal: float, tracks: int, seed: int) -> JointFit:
-    """The joint between the two largest rigid groups of tracks (N, T, 2), px from the principal point.
+def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, seed: int) -> JointFit | None:
+    """The joint between the two largest rigid groups of tracks, px from the principal point.
 
     None if there are no two groups.
     """
-    bodies = two_bodies(uv, view.focal, seed)
+    bodies = two_bodies(paths.uv, view.focal, seed)
     if bodies is None:
         return None
     static, link = bodies
     starts = joints_between(static, link)
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])
-    done = finish({k: [b] for k, b in starts.items()}, uv, np.flatnonzero(link.members), view, still)
+    done = finish({k: [b] for k, b in starts.items()}, paths, np.flatnonzero(link.members), view, still)
     if reason := _why_not_believed(done):
-        return JointFit("refused", reason, tracks=tracks, inliers=len(done.members))
+        return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members))
     note = "; the camera moves: its path is fitted together with the joint"
-    return _result(video, done, full_focal, tracks, note, KNOWN_STD if view.focal_std == 0 else None)
+    return _result(video, done, full_focal, len(paths), note, KNOWN_STD if view.focal_std == 0 else None)
 
 
 def _why_not_believed(done: Finished, restlessness: float = np.inf) -> str | None:
@@ -378,7 +389,7 @@ def _result(
     far = int(np.argmax(np.abs(q)))
     if q[far] < 0:
         q, axis = -q, -axis
-    points = b.X / unit
+    points, stay = b.X / unit, _stay(b, sight)
     pivot, origin = None, np.median(points, axis=0)
     if turns:
         c = b.twist.point / unit
@@ -426,8 +437,8 @@ def _result(
         video.index,
         K,
         np.linalg.inv(T_world_camera),
-        points @ R.T + t,
-        done.members,
+        (points @ R.T + t)[stay],
+        done.members[stay],
         False,
         "none",
         std,
@@ -437,6 +448,16 @@ def _result(
         moving_frames=_moving_frames(q, video.time),
     )
     return replace(fit, image_line=image_line(fit))
+
+
+def _stay(b: Bundle, s: Sightings) -> np.ndarray:
+    """(N,) bool: points whose tracks stayed on them; all of them where hardly any did. What slides along an edge has a
+    say in the joint, but is in no one place of the link."""
+    off = np.linalg.norm(residuals(b, replace(s, slip=None)), axis=-1)
+    out = np.zeros(len(off), bool)
+    some = s.seen.any(1)
+    out[some] = np.nanmedian(np.where(s.seen, off, np.nan)[some], axis=1) < SLID_PX
+    return out if out.sum() >= MIN_INLIERS else np.ones(len(off), bool)
 
 
 def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reconstruct.joint.paths import Paths, held
+
 DIRECTIONS = 600
 """Of v, over half a sphere: 6 deg from one to the next."""
 FLOOR_PX = 0.15
@@ -41,14 +43,14 @@ class Flow:
     Attributes:
         ids: (n,) indices of the tracks that have one.
         x, u: (n, 2) rays at z = 1 in the middle of the path; velocity over the whole path, in the same unit.
-        std: (n,) of one coordinate of u.
+        cov: (n, 2, 2) of u.
         path: (T,) how far the motion has come in every frame, 0 to 1.
     """
 
     ids: np.ndarray
     x: np.ndarray
     u: np.ndarray
-    std: np.ndarray
+    cov: np.ndarray
     path: np.ndarray
 
 
@@ -71,32 +73,39 @@ class Candidate:
     cost: float
 
 
-def flow_of(uv: np.ndarray, focal: float) -> Flow | None:
+def flow_of(paths: Paths, focal: float) -> Flow | None:
     """Velocities by a parabola through every track over the path that they have in common.
 
     Args:
-        uv: (N, T, 2) px from the principal point, NaN where not seen.  focal: px.
+        paths: N tracks, px from the principal point.  focal: px.
 
     Returns:
         None if no path is told.
     """
-    seen = np.isfinite(uv[..., 0])
-    enough = np.flatnonzero(seen.sum(1) >= FEW_FRAMES)
+    enough = np.flatnonzero(paths.seen.sum(1) >= FEW_FRAMES)
     if len(enough) < FEW_FRAMES:
         return None
-    path = _common_path(uv[enough], seen[enough])
+    some = paths[enough]
+    seen = some.seen
+    path = _common_path(some.moved(), seen)
     if path is None:
         return None
     at = np.stack([np.ones_like(path), path - 0.5, (path - 0.5) ** 2], axis=1)
-    m, x = seen[enough].astype(float), np.nan_to_num(uv[enough])
-    inverse = np.linalg.inv(np.einsum("nt,ti,tj->nij", m, at, at) + np.diag([1e-9, 1e-9, 1e-4]))
-    along = inverse @ np.einsum("nt,ti,ntk->nik", m, at, x)
-    off = (x - np.einsum("ti,nik->ntk", at, along)) * m[..., None]
-    rough = np.sqrt(np.sum(off**2, axis=(1, 2)) / np.maximum(2 * m.sum(1) - 6, 1))
-    part = np.array([np.ptp(path[s]) for s in seen[enough]])
+    x = np.nan_to_num(some.uv)
+    # The squared weight of either coordinate, (n, T, 2, 2): the same of both but for what slides.
+    W = held(np.broadcast_to(np.eye(2), (*seen.shape, 2, 2)), some.slip)
+    W = np.swapaxes(W, -1, -2) @ W * seen[..., None, None]
+    normal = np.einsum("ti,tj,ntab->niajb", at, at, W, optimize=True).reshape(len(x), 6, 6)
+    inverse = np.linalg.inv(normal + np.diag([1e-9, 1e-9, 1e-9, 1e-9, 1e-4, 1e-4]))
+    right = np.einsum("ti,ntab,ntb->nia", at, W, x, optimize=True).reshape(len(x), 6, 1)
+    along = (inverse @ right).reshape(len(x), 3, 2)
+    off = held((x - np.einsum("ti,nia->nta", at, along)) * seen[..., None], some.slip)
+    rough = np.sqrt(np.sum(off**2, axis=(1, 2)) / np.maximum(2 * seen.sum(1) - 6, 1))
+    part = np.array([np.ptp(path[s]) for s in seen])
     good = (part > PART) & (rough < ROUGH_PX)
-    std = np.hypot(FLOOR_PX, rough * np.sqrt(inverse[:, 1, 1]))
-    return Flow(enough[good], along[good, 0] / focal, along[good, 1] / focal, std[good] / focal, path)
+    floor = FLOOR_PX**2 * np.linalg.inv(W.sum(1) / seen.sum(1)[:, None, None])
+    cov = (floor + rough[:, None, None] ** 2 * inverse[:, 2:4, 2:4]) / focal**2
+    return Flow(enough[good], along[good, 0] / focal, along[good, 1] / focal, cov[good], path)
 
 
 def _common_path(uv: np.ndarray, seen: np.ndarray, rounds: int = 8) -> np.ndarray | None:
@@ -146,18 +155,19 @@ def candidates(flow: Flow, hinges: int, slides: int) -> list[Candidate]:
 
 
 def _tried(flow: Flow, kind: str, way: np.ndarray) -> tuple[np.ndarray, ...]:
-    """For every direction (D, 3) of v: cost (D,), w (D, 3), residual over std (D, n), and inverse depth (D, n) over
-    the median's, which is the fourth, (D,)."""
-    x, u, std = flow.x, flow.u, flow.std
+    """For every direction (D, 3) of v: cost (D,), w (D, 3), residual over std (D, n), whether the depth is one that a
+    link may have (D, n), the inverse depth over the median's (D, n), and that (D,)."""
+    x, u = flow.x, flow.u
     e = way[:, None, :2] - x[None] * way[:, None, 2:]  # (D, n, 2)
     size = np.maximum(np.linalg.norm(e, axis=-1), 1e-9)
     across = np.stack([-e[..., 1], e[..., 0]], axis=-1) / size[..., None]
+    std = np.sqrt(np.einsum("dni,nij,dnj->dn", across, flow.cov, across, optimize=True))
     B = turning(x)
     y = np.einsum("dni,ni->dn", across, u) / std
     w = np.zeros((len(way), 3))
     if kind == "revolute":
         basis = np.linalg.svd(way[:, None, :])[2][:, 1:]  # (D, 2, 3), perpendicular to v
-        A = np.einsum("dni,nij,dkj->dnk", across, B, basis, optimize=True) / std[:, None]
+        A = np.einsum("dni,nij,dkj->dnk", across, B, basis, optimize=True) / std[..., None]
         z, scale = np.zeros((len(way), 2)), WIDE
         for _ in range(ROUNDS):
             weight = 1 / (1 + ((y - (A @ z[..., None])[..., 0]) / scale) ** 2) ** 2
@@ -168,22 +178,24 @@ def _tried(flow: Flow, kind: str, way: np.ndarray) -> tuple[np.ndarray, ...]:
             scale = max(NARROW * scale, 1.0)
         y = y - (A @ z[..., None])[..., 0]
         w = np.einsum("dk,dkj->dj", z, basis)
-    rho = np.sum((u[None] - np.einsum("nij,dj->dni", B, w)) * e, axis=-1) / size**2
+    told = np.einsum("nij,dnj->dni", np.linalg.inv(flow.cov), e, optimize=True)
+    known = np.sum(told * e, axis=-1)
+    rho = np.sum((u[None] - np.einsum("nij,dj->dni", B, w)) * told, axis=-1) / known
     near = np.abs(y) < CUT
     few = near.sum(1) < FEW_FRAMES
     middle = np.nanmedian(np.where(near | few[:, None], rho, np.nan), axis=1)
-    rho = rho / middle[:, None]
-    good = near & (rho > 1 / DEEP) & (rho < DEEP)
-    cost = np.sum(np.where(good, y**2, CUT**2), axis=1)
-    return np.where(few, np.inf, cost), w, y, rho, middle
+    rho, unsure = rho / middle[:, None], 1 / np.sqrt(known) / np.abs(middle[:, None])
+    sane = (rho + unsure > 1 / DEEP) & (rho - unsure < DEEP)
+    cost = np.sum(np.where(near & sane, y**2, CUT**2), axis=1)
+    return np.where(few, np.inf, cost), w, y, sane, rho, middle
 
 
 def _judged(flow: Flow, kind: str, way: np.ndarray) -> list[Candidate]:
-    cost, w, y, rho, middle = _tried(flow, kind, way)
+    cost, w, y, sane, rho, middle = _tried(flow, kind, way)
     out = []
     for k in np.flatnonzero(np.isfinite(cost)):
         depth = np.where(rho[k] > 0, 1 / np.maximum(rho[k], 1e-3), 1.0)
-        good = (np.abs(y[k]) < CUT) & (rho[k] > 1 / DEEP) & (rho[k] < DEEP)
+        good = (np.abs(y[k]) < CUT) & sane[k]
         out.append(Candidate(kind, middle[k] * way[k], w[k], np.clip(depth, 1 / DEEP, DEEP), good, float(cost[k])))
     return out
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from reconstruct.joint.paths import held
 from reconstruct.joint.polish import noise
 from reconstruct.joint.twist import skew
 
@@ -363,11 +364,12 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     return Rigid(R, t / unit, X / unit, members, sigma, cost)
 
 
-def adjust(x, seen, R, t, X, focal, iterations: int = 8):
+def adjust(x, seen, R, t, X, focal, iterations: int = 8, slip=None):
     """Robust bundle adjustment of all poses but the first, and points (Schur complement).
 
     Args:
         x: (N, T, 2) rays.  seen: (N, T) bool.  R, t: (T, 3, 3), (T, 3) body to camera.  X: (N, 3).
+        slip: (N, T, 2) as in paths.py.
 
     Returns:
         R, t, X and the noise of one coordinate, px.
@@ -379,7 +381,7 @@ def adjust(x, seen, R, t, X, focal, iterations: int = 8):
 
     def project(R, t, P):
         Y = np.einsum("tij,nj->nti", R, P) + t
-        r = (Y[..., :2] / np.maximum(Y[..., 2:], 1e-3) - x) * focal
+        r = held((Y[..., :2] / np.maximum(Y[..., 2:], 1e-3) - x) * focal, slip)
         return Y, np.where(seen[..., None], r, 0.0)
 
     Y, r = project(R, t, P)
@@ -394,6 +396,7 @@ def adjust(x, seen, R, t, X, focal, iterations: int = 8):
         J = np.zeros((N, T, 2, 3))
         J[..., 0, 0] = J[..., 1, 1] = focal / z
         J[..., 0, 2], J[..., 1, 2] = -focal * Y[..., 0] / z**2, -focal * Y[..., 1] / z**2
+        J = held(J, slip)
         Jc = np.concatenate([J @ -skew(Y - t), J], axis=-1)  # (N, T, 2, 6)
         Jx = J @ R
         wJc = w[..., None, None] * Jc

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from reconstruct.joint.bundle import Observations, State
 from reconstruct.joint.finish import Still, View, bundle_of_state
 from reconstruct.joint.groups import adjust, resect, triangulated
+from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import place_points, polish
 
 LEAST = 40
@@ -111,24 +112,24 @@ def _off(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.nd
     return out
 
 
-def scaled_to_link(path: Path, start: tuple[State, Observations], uv: np.ndarray, members: np.ndarray, view: View
+def scaled_to_link(path: Path, start: tuple[State, Observations], paths: Paths, members: np.ndarray, view: View
                    ) -> tuple[View, Still]:  # fmt: skip
     """Camera and scene with the link's median depth as the unit: at the ratio of depths at which the joint fits best.
 
     Args:
         start: the joint found so far and its key-frame observations, of the tracks ``members`` (n,).
-        uv: (N, T, 2) px from the principal point, as filmed.
+        paths: N tracks, px from the principal point, as filmed.
         view: focal length; its camera is replaced.
 
     Returns:
         The view with the path, (T, 3, 3) and (T, 3), and the scene that rests.
     """
-    some = np.unique(np.linspace(0, uv.shape[1] - 1, FEW_FRAMES).round().astype(int))
+    some = np.unique(np.linspace(0, paths.uv.shape[1] - 1, FEW_FRAMES).round().astype(int))
     b = bundle_of_state(*start, some)
     costs = []
     for ratio in RATIOS:
         there = replace(view, R=path.R, t=path.t * ratio, restless=0.0)
-        sight = there.sightings(uv[members], some, lasting=100.0)
+        sight = there.sightings(paths[members], some, lasting=100.0)
         costs.append(polish(place_points(b, sight), sight, iterations=6, scale=COARSE_PX, sharpen=False).cost)
     ratio = float(RATIOS[int(np.argmin(costs))])
     scene = Still(path.ids, path.X * ratio, known=True, sigma=path.sigma)

@@ -3,11 +3,12 @@
 For an axis direction a, a total angle and a motion profile, the rotations R_t are known, and a track's
 unknown depth lambda and the pivot c (perpendicular to a) enter linearly:
 
-    x_t x (lambda R_t x_0 + (I - R_t) c) = 0.
+    X_t = lambda R_t x_0 + (I - R_t) c,    X_t,xy - x_t X_t,z = 0.
 
 The depth is eliminated per track, which leaves a 2 x 2 form in c; its smallest eigenvector over small
 random subsets of tracks gives pivots, and a truncated reprojection error over all tracks ranks them.
-A prismatic direction d enters in the same way: x_t x (lambda x_0 + s_t d) = 0.
+A prismatic direction d enters in the same way: X_t = lambda x_0 + s_t d. What slides along edges counts for less
+(paths.py).
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
+from reconstruct.joint.paths import held
 
 ANGLES = np.radians([15.0, 35.0, 60.0, 90.0, 120.0])
 
@@ -62,6 +65,17 @@ def _rotate(a: np.ndarray, angle: np.ndarray, v: np.ndarray) -> np.ndarray:
     return along + cos * (v - along) + sin * np.cross(a, v)
 
 
+def _off_ray(X: np.ndarray, x: np.ndarray, seen: np.ndarray, slip: np.ndarray | None) -> np.ndarray:
+    """(..., 2) by how much points (..., 3) miss the rays x, times their depth; 0 where not seen. Linear in X."""
+    r = (X[..., :2] - x[..., :2] * X[..., 2:]) * seen[..., None]
+    return held(r, None if slip is None else np.broadcast_to(slip, r.shape))
+
+
+def _motion2(rays: np.ndarray, slip: np.ndarray | None) -> np.ndarray:
+    """(n,) largest squared way from the reference frame, the first, ray units."""
+    return np.nanmax(np.sum(held(rays[:, 1:, :2] - rays[:, :1, :2], slip) ** 2, axis=-1), axis=1, initial=0.0)
+
+
 def _smallest_eigenvector_2x2(M: np.ndarray) -> np.ndarray:
     """(..., 2, 2) symmetric -> (..., 2) unit eigenvector of the smaller eigenvalue."""
     a, b, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 1]
@@ -80,6 +94,7 @@ def revolute_hypotheses(
     subsets: int = 40,
     keep: int = 6,
     whole: np.ndarray | None = None,
+    slip: np.ndarray | None = None,
 ) -> list[Hypothesis]:
     """Axis lines from one window.
 
@@ -92,9 +107,11 @@ def revolute_hypotheses(
         rng: for the subsets.
         directions, subsets, keep: size of the search and number of results.
         whole: profile in `frames` that the hypotheses carry (default: `profile`).
+        slip: (n, m, 2) as in paths.py.
     """
     n, m, _ = rays.shape
     whole = profile if whole is None else whole
+    slip = None if slip is None else slip[:, 1:]
     per_track = np.broadcast_to(profile, (n, m))
     shared = profile.ndim == 1
     seen = np.isfinite(rays[..., 0])
@@ -102,13 +119,13 @@ def revolute_hypotheses(
     dirs = hemisphere(directions)
     angles = np.concatenate([ANGLES, -ANGLES])
     picks = np.stack([rng.choice(n, size=min(5, n), replace=False, p=weight / weight.sum()) for _ in range(subsets)])
-    motion2 = np.nanmax(np.sum((rays - rays[:, :1]) ** 2, axis=-1), axis=1)
+    motion2 = _motion2(rays, slip)
     found: list[tuple[float, np.ndarray, np.ndarray, float]] = []
     for theta in angles:
         q = theta * (profile[None] if shared else per_track)[:, 1:]  # (1 or n, m-1)
         basis = perpendicular_basis(dirs)
         y = _rotate(dirs[:, None, None], q[None], x[None, :, :1])  # (d, n, m-1, 3)
-        A = np.cross(x[None, :, 1:], y)
+        A = _off_ray(y, x[None, :, 1:], seen[None, :, 1:], slip)
         C = np.stack(  # (I - R) basis, (d, 1 or n, m-1, 2, 3)
             [
                 basis[:, None, None, :, k] - _rotate(dirs[:, None, None], q[None], basis[:, None, None, :, k])
@@ -116,9 +133,9 @@ def revolute_hypotheses(
             ],
             axis=-2,
         )
-        B = np.cross(x[None, :, 1:, None, :], C)
+        B = [_off_ray(C[..., k, :], x[None, :, 1:], seen[None, :, 1:], slip) for k in range(2)]
         flat = A.reshape(*A.shape[:2], -1)
-        sides = np.moveaxis(B, -2, -1).reshape(*flat.shape, 2)  # (d, n, (m-1) 3, 2)
+        sides = np.stack(B, axis=-1).reshape(*flat.shape, 2)  # (d, n, (m-1) 2, 2)
         AA = np.sum(flat**2, axis=-1) + 1e-12
         AB = (flat[:, :, None] @ sides)[:, :, 0]
         BB = sides.swapaxes(-1, -2) @ sides
@@ -162,6 +179,7 @@ def prismatic_hypotheses(
     directions: int = 600,
     keep: int = 3,
     whole: np.ndarray | None = None,
+    slip: np.ndarray | None = None,
 ) -> list[Hypothesis]:
     """Slide directions from one window; arguments as for :func:`revolute_hypotheses`.
 
@@ -172,13 +190,15 @@ def prismatic_hypotheses(
     seen = np.isfinite(rays[..., 0])
     x = np.where(seen[..., None], rays, 0.0)
     dirs = np.concatenate([hemisphere(directions // 2), -hemisphere(directions // 2)])
-    A = np.cross(x[:, 1:], np.broadcast_to(x[:, :1], x[:, 1:].shape))
-    B = np.cross(x[None, :, 1:], dirs[:, None, None]) * np.broadcast_to(profile, (n, m))[None, :, 1:, None]
+    slip = None if slip is None else slip[:, 1:]
+    A = _off_ray(np.broadcast_to(x[:, :1], x[:, 1:].shape), x[:, 1:], seen[:, 1:], slip)
+    B = _off_ray(dirs[:, None, None], x[None, :, 1:], seen[None, :, 1:], slip)
+    B = B * np.broadcast_to(profile, (n, m))[None, :, 1:, None]
     AA = np.einsum("nmi,nmi->n", A, A) + 1e-12
     lam = -np.einsum("nmi,dnmi->dn", A, B) / AA
     r = np.einsum("nmi,dn->dnmi", A, lam) + B
     err2 = np.einsum("dnmi,dnmi->dn", r, r) / np.maximum(seen[:, 1:].sum(1), 1) / np.maximum(lam, 1e-3) ** 2
-    motion2 = np.nanmax(np.sum((rays - rays[:, :1]) ** 2, axis=-1), axis=1)
+    motion2 = _motion2(rays, slip)
     score = (np.clip(1 - err2 / tol**2, 0, None) * (lam > 0) * (motion2 > tol**2)) @ weight
     out: list[Hypothesis] = []
     for d in np.argsort(-score):

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from reconstruct.joint.paths import held
 from reconstruct.joint.twist import Twist, skew
 
 BEND = 0.1
@@ -24,6 +25,8 @@ HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.5
 """Median distance of a hinge from the link's middle over the link's size, and the standard deviation of its logarithm.
 The hinges of simulated furniture lie 0.34 to 0.64 link diagonals away (knobs less); texture on a part of the link only
 makes it look smaller."""
+REACH = 1.5
+"""Link sizes from the middle up to which a point may lie anywhere."""
 GAUGE = 0.4
 """Logarithm of the link's depth beyond which it is brought back to 1."""
 
@@ -42,6 +45,7 @@ class Sightings:
         link: (N,) bool, on the link (the others rest); all of them when None.
         relative: (N,) noise over that of the link's tracks; 1 when None.
         free: True if the camera's poses are unknown, R and t but a start; the world is the first camera then.
+        slip: (N, T, 2) along what the picture holds badly, see paths.py; None if there is none.
     """
 
     uv: np.ndarray
@@ -56,6 +60,12 @@ class Sightings:
     link: np.ndarray | None = None
     relative: np.ndarray | None = None
     free: bool = False
+    slip: np.ndarray | None = None
+
+    def of(self, tracks: np.ndarray) -> Sightings:
+        """Of some of the tracks of a link."""
+        slip = None if self.slip is None else self.slip[tracks]
+        return replace(self, uv=self.uv[tracks], seen=self.seen[tracks], weight=self.weight[tracks], slip=slip)
 
     @property
     def scaleless(self) -> bool:
@@ -107,10 +117,10 @@ def positions(b: Bundle, s: Sightings) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residuals(b: Bundle, s: Sightings, cam: np.ndarray | None = None) -> np.ndarray:
-    """(N, T, 2) px, 0 where not seen."""
+    """(N, T, 2) px, as far as the picture holds them (paths.py); 0 where not seen."""
     cam = positions(b, s)[1] if cam is None else cam
     z = np.maximum(cam[..., 2:], 1e-3)
-    r = s.focal * np.exp(b.log_focal) * cam[..., :2] / z - s.uv
+    r = held(s.focal * np.exp(b.log_focal) * cam[..., :2] / z - s.uv, s.slip)
     r = np.where(cam[..., 2:] < 1e-3, 1e3, r)
     return np.where(s.seen[..., None], r, 0.0)
 
@@ -200,7 +210,7 @@ def normal_equations(
     P = np.zeros((N, T, 2, 3))
     P[..., 0, 0] = P[..., 1, 1] = f / z
     P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
-    in_camera = P
+    P = in_camera = held(P, s.slip)
     camera = s.R if b.R is None else b.R
     if camera is not None:
         P = P @ camera
@@ -220,7 +230,7 @@ def normal_equations(
     if s.link is not None:
         Jg[~s.link] = 0.0
     if s.focal_std > 0:
-        Jf = (f * cam[..., :2] / z[..., None])[..., None]
+        Jf = held(f * cam[..., :2] / z[..., None], s.slip)[..., None]
         Jg = np.concatenate([Jg, Jf], axis=-1)
     Jq = (P @ (np.cross(tw.curvature, world - tw.anchor) + tw.direction)[..., None])[..., 0]
     if s.link is not None:
@@ -268,6 +278,44 @@ def normal_equations(
 
 
 @dataclass(frozen=True)
+class Reach:
+    """How far a link's points may lie from its middle: what is farther costs the squared distance from that sphere.
+
+    A point on an edge that goes along its own image has no depth but this, and a joint of the wrong type takes up what
+    contradicts it in points far before or behind the link.
+
+    Attributes:
+        middle: (3,).  radius: of the sphere.  weight: px^2 over a squared length; 0 beside a resting scene.
+    """
+
+    middle: np.ndarray
+    radius: float
+    weight: float
+
+    @classmethod
+    def of(cls, b: Bundle, s: Sightings, sigma: float) -> Reach:
+        """The link's size is read across the line of sight, and is one standard deviation beyond the sphere."""
+        middle = np.median(b.X, axis=0)
+        across = b.X[:, :2] / np.maximum(b.X[:, 2:], 1e-3) * middle[2]
+        size = float(np.linalg.norm(np.quantile(across, 0.95, axis=0) - np.quantile(across, 0.05, axis=0)))
+        weight = 0.0 if s.link is not None or size <= 0 else s.lasting * (sigma / size) ** 2
+        return cls(middle, REACH * size, weight)
+
+    def cost(self, X: np.ndarray) -> float:
+        """Of points (N, 3), px^2."""
+        return self.weight * float(np.sum(np.maximum(np.linalg.norm(X - self.middle, axis=1) - self.radius, 0) ** 2))
+
+    def slopes(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3, 3) and (N, 3) of half the cost by the points."""
+        d = X - self.middle
+        far = np.linalg.norm(d, axis=1)
+        out = d / np.maximum(far, 1e-12)[:, None]
+        beyond = np.maximum(far - self.radius, 0)
+        H = self.weight * (beyond > 0)[:, None, None] * out[:, :, None] * out[:, None]
+        return H, self.weight * beyond[:, None] * out
+
+
+@dataclass(frozen=True)
 class _Priors:
     """What is known besides the pictures, as squares in px^2.
 
@@ -276,12 +324,14 @@ class _Priors:
         bend: (T, T) of q's second differences.
         radius, log_turn: weight of a hinge's radius, and the logarithm of the turn that the path at hand is expected to
             be; 0 for a slide.
+        reach: of the link's points.
     """
 
     focal: float
     bend: np.ndarray
     radius: float
     log_turn: float
+    reach: Reach
 
     @classmethod
     def of(cls, b: Bundle, s: Sightings, sigma: float, hold: float = 1.0) -> _Priors:
@@ -294,10 +344,11 @@ class _Priors:
         bend = s.bend * (sigma / (BEND * max(np.ptp(b.q), 1e-9))) ** 2
         far = float(np.max(np.abs(b.q)))
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
+        reach = Reach.of(b, s, sigma)
         if b.kind == "prismatic" or s.link is not None or far <= 0 or size <= 0:
-            return cls(focal, bend, 0.0, 0.0)
+            return cls(focal, bend, 0.0, 0.0, reach)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
-        return cls(focal, bend, radius, float(np.log(far / (HINGE_RADIUS * size))))
+        return cls(focal, bend, radius, float(np.log(far / (HINGE_RADIUS * size))), reach)
 
     def cost(self, b: Bundle) -> float:
         """Without the radius, which is weighed apart where types are compared."""
@@ -315,6 +366,9 @@ class _Priors:
             n.g[G] += self.focal * b.log_focal
         n.H[A : A + T, A : A + T] += self.bend
         n.g[A : A + T] += self.bend @ b.q
+        H, g = self.reach.slopes(b.X)
+        n.Hp[...] += H
+        n.gp[...] += g
         k2 = float(b.twist.curvature @ b.twist.curvature)
         if self.radius and k2 > 0:
             far = int(np.argmax(np.abs(b.q)))
@@ -355,7 +409,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
         loss, w = robust_loss(r, s, limit)
         for _ in range(iterations):
             priors = _Priors.of(b, s, sigma, hold)
-            cost = loss + priors.cost(b) + priors.radius_cost(b)
+            cost = loss + priors.cost(b) + priors.radius_cost(b) + priors.reach.cost(b.X)
             n = normal_equations(b, s, world, cam, r, w)
             priors.add(n, b)
             better = False
@@ -374,7 +428,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
                 world_t, cam_t = positions(trial, s)
                 r_t = residuals(trial, s, cam_t)
                 loss_t, w_t = robust_loss(r_t, s, limit)
-                cost_t = loss_t + priors.cost(trial) + priors.radius_cost(trial)
+                cost_t = loss_t + priors.cost(trial) + priors.radius_cost(trial) + priors.reach.cost(trial.X)
                 if cost_t < cost:
                     better = cost - cost_t > 1e-7 * cost
                     b, world, cam, r, w, loss = trial, world_t, cam_t, r_t, w_t, loss_t
@@ -457,6 +511,7 @@ def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
         P = np.zeros((*z.shape, 2, 3))
         P[..., 0, 0] = P[..., 1, 1] = f / z
         P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
+        P = held(P, s.slip)
         camera = s.R if b.R is None else b.R
         J = (P if camera is None else P @ camera) @ b.twist.pose(b.q)[0]
         if s.link is not None:
@@ -464,6 +519,8 @@ def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
         H = np.einsum("nt,ntij,ntik->njk", w, J, J, optimize=True)
         g = np.einsum("nt,ntij,nti->nj", w, J, r, optimize=True)
         H += (1e-4 * np.trace(H, axis1=1, axis2=2) / 3 + 1e-12)[:, None, None] * np.eye(3)
+        by_reach = Reach.of(b, s, b.sigma).slopes(b.X)
+        H, g = H + by_reach[0], g + by_reach[1]
         step = -np.linalg.solve(H, g[..., None])[..., 0]
         limit_step = 0.4 * np.linalg.norm(b.X, axis=1)
         step *= np.minimum(1, limit_step / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]

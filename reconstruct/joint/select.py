@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
 from reconstruct.joint.groups import farthest, neighbours, paths_of_patch
 from reconstruct.joint.hypotheses import Hypothesis, prismatic_hypotheses, revolute_hypotheses
+from reconstruct.joint.paths import Paths, held
 
 SCORE_PX = 3.0
 """Scale of the robust score, working px."""
@@ -65,7 +66,7 @@ def motion_stretches(uv: np.ndarray, time: np.ndarray, gap: float = 0.4, shortes
 
 
 def observations(
-    uv_work: np.ndarray,
+    paths: Paths,
     focal_work: float,
     centre: np.ndarray,
     frames: np.ndarray,
@@ -76,13 +77,12 @@ def observations(
     """Key-frame observations of moving tracks, thinned so that no textured spot dominates.
 
     Returns:
-        observations, and (N,) indices into uv_work of the tracks kept.
+        observations, and (N,) indices into the paths of the tracks kept.
     """
-    uv = uv_work[:, frames]
-    seen = np.isfinite(uv[..., 0])
-    enough = seen.sum(1) >= 4
-    ids = np.flatnonzero(enough)
-    uv, seen = uv[ids], seen[ids]
+    keys = paths.at(frames)
+    ids = np.flatnonzero(keys.seen.sum(1) >= 4)
+    keys, moved = keys[ids], paths[ids].moved()
+    uv, seen = keys.uv, keys.seen
     middle = np.array([np.flatnonzero(s)[s.sum() // 2] for s in seen])
     place = uv[np.arange(len(ids)), middle]
     # Weight by the reciprocal of the number of neighbours in time and place: area counts, not texture.
@@ -90,14 +90,14 @@ def observations(
         np.abs(middle[:, None] - middle[None]) <= 3
     )
     weight = 1.0 / np.sqrt(near.sum(1))
-    motion = np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1)
+    motion = np.nanmax(moved[:, frames], axis=1) - np.nanmin(moved[:, frames], axis=1)
     reach = np.linalg.norm(motion, axis=1)
-    weight *= np.clip(reach / (0.06 * diagonal), 0.05, 1.0) * coherence(uv_work[ids])
+    weight *= np.clip(reach / (0.06 * diagonal), 0.05, 1.0) * coherence(moved)
     if len(ids) > limit:
         pick = np.sort(rng.choice(len(ids), limit, replace=False, p=weight**2 / np.sum(weight**2)))
-        ids, uv, seen, middle, weight = ids[pick], uv[pick], seen[pick], middle[pick], weight[pick]
+        ids, uv, seen, middle, weight, keys = ids[pick], uv[pick], seen[pick], middle[pick], weight[pick], keys[pick]
     xy = np.where(seen[..., None], (uv - centre) / focal_work, 0.0)
-    return Observations(xy, seen, middle, weight, 1.0 / focal_work, frames), ids
+    return Observations(xy, seen, middle, weight, 1.0 / focal_work, frames, keys.slip), ids
 
 
 def coherence(uv: np.ndarray) -> np.ndarray:
@@ -162,7 +162,7 @@ def _global_hypotheses(obs: Observations, rng: np.random.Generator, rounds: int 
     for _ in range(rounds):
         n = min(90, len(obs.ref))
         ids = rng.choice(len(obs.ref), n, replace=False, p=obs.weight / obs.weight.sum())
-        rays = np.full((n, m, 3), np.nan)
+        rays, slip = np.full((n, m, 3), np.nan), np.zeros((n, m, 2))
         local = np.zeros((n, m))
         for row, i in enumerate(ids):
             keys = np.flatnonzero(obs.seen[i])
@@ -170,8 +170,11 @@ def _global_hypotheses(obs: Observations, rng: np.random.Generator, rounds: int 
             keys = np.roll(keys, -(len(keys) // 2))  # the middle one is the reference
             rays[row, : len(keys)] = np.concatenate([obs.xy[i, keys], np.ones((len(keys), 1))], axis=1)
             local[row, : len(keys)] = profile[keys] - profile[keys[0]]
+            if obs.slip is not None:
+                slip[row, : len(keys)] = obs.slip[i, keys]
         args = (rays, np.arange(K), local, obs.weight[ids], 3.0 * obs.px, rng)
-        out += revolute_hypotheses(*args, whole=profile) + prismatic_hypotheses(*args, whole=profile)
+        more = dict(whole=profile, slip=None if obs.slip is None else slip)
+        out += revolute_hypotheses(*args, **more) + prismatic_hypotheses(*args, **more)
     return out
 
 
@@ -192,7 +195,8 @@ def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator, m
         k = k[np.unique(np.linspace(0, len(k) - 1, 9).round().astype(int))]
     rays = np.concatenate([obs.xy[ids][:, k], np.ones((len(ids), len(k), 1))], axis=-1)
     rays[~obs.seen[ids][:, k]] = np.nan
-    moved = np.linalg.norm(rays[..., :2] - rays[:, :1, :2], axis=-1)
+    slip = None if obs.slip is None else obs.slip[ids][:, k]
+    moved = np.linalg.norm(held(rays[..., :2] - rays[:, :1, :2], slip), axis=-1)
     top = np.nanmax(moved, axis=1)
     w = obs.weight[ids] * np.clip(top / (30 * obs.px), 0, 1)
     # The profile is read off the tracks that move most: the others are the static link, or jitter.
@@ -204,7 +208,8 @@ def _one_window(obs: Observations, keys: np.ndarray, rng: np.random.Generator, m
     tol = 3.0 * obs.px
     if (w > 0).sum() < 8:
         return []
-    return revolute_hypotheses(rays, k, profile, w, tol, rng) + prismatic_hypotheses(rays, k, profile, w, tol, rng)
+    args = (rays, k, profile, w, tol, rng)
+    return revolute_hypotheses(*args, slip=slip) + prismatic_hypotheses(*args, slip=slip)
 
 
 PATCHES, PATCH_SIZES = 18, (30, 80)
@@ -312,6 +317,7 @@ def _search_state(
         obs.weight[sub],
         obs.px,
         np.arange(31 + len(s.q)),
+        None if obs.slip is None else np.repeat(obs.slip[sub, t][:, None], 31 + len(s.q), axis=1),
     )
     cand.xy[np.arange(len(sub)), now.ref[sub]] = rays[:, :2]
     trial = replace(s, q=np.concatenate([s.q, grid]), depth=s.depth[sub])
@@ -357,7 +363,7 @@ def explained_by(
         (N,) share in (-inf, 1], and (N,) amount of motion, about the number of frames in which the track is away.
     """
     own = obs.xy[np.arange(len(obs.ref)), obs.ref][:, None]
-    moved2 = np.sum(((obs.xy - own) / obs.px) ** 2, axis=-1)
+    moved2 = np.sum(held((obs.xy - own) / obs.px, obs.slip) ** 2, axis=-1)
     rho = lambda e2: 1 - 1 / (1 + e2 / scale**2)  # noqa: E731
     counted = obs.seen & valid
     amount = np.where(counted, rho(moved2), 0).sum(1)

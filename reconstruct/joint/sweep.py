@@ -16,6 +16,7 @@ import numpy as np
 from reconstruct.joint.bundle import Observations
 from reconstruct.joint.finish import View, followers, states_of_all_frames
 from reconstruct.joint.flow import Candidate, Flow, candidates, flow_of
+from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, Sightings, place_points, polish, radius_cost, residuals, robust_loss
 from reconstruct.joint.twist import Twist
 
@@ -54,12 +55,12 @@ class Swept:
 
 
 def sweep(
-    uv: np.ndarray, moving: np.ndarray, obs: Observations, members: np.ndarray, rivals: Sequence[Bundle], view: View
+    paths: Paths, moving: np.ndarray, obs: Observations, members: np.ndarray, rivals: Sequence[Bundle], view: View
 ) -> Swept | None:
     """The joint that fits best at the noise of the tracks, whatever the search said.
 
     Args:
-        uv: (N, T, 2) px from the principal point, NaN where not seen.  moving: (m,) tracks that leave their place.
+        paths: N tracks, px from the principal point.  moving: (m,) tracks that leave their place.
         obs: the search's observations, for its key frames.  members: (n,) tracks that the search took for the link.
         rivals: the search's joints, with these points and the states of the key frames; they compete.
         view: focal length; the camera rests.
@@ -72,14 +73,14 @@ def sweep(
     pool, found = members, None
     field = [replace(b, q=b.q[some] - b.q[some[0]]) for b in rivals]
     for _ in range(SWEEPS):
-        flow = flow_of(uv[pool], view.focal)
+        flow = flow_of(paths[pool], view.focal)
         ways = [] if flow is None else candidates(flow, HINGES, SLIDES)
         # Tracks that follow any of them: what follows none is no evidence.
         good = np.flatnonzero(np.any([c.good for c in ways], axis=0)) if ways else []
         if flow is None or len(good) < FEWEST:
             break
         pick = good[_evenly(len(good), TRACKS)]
-        sight = view.sightings(uv[pool[flow.ids[pick]]], keys, lasting=100.0)
+        sight = view.sightings(paths[pool[flow.ids[pick]]], keys, lasting=100.0)
         several = _narrowed([_start(c, flow, pick, keys) for c in ways] + [_placed(b, sight) for b in field], sight)
         lead = several[0]
         if found is not None and lead.sigma > SHARPER * found[0].sigma:
@@ -87,7 +88,7 @@ def sweep(
         like = replace(sight, lasting=1.0)
         # Tracks picked by one type are no evidence for it: those that follow the best of the other count as well.
         each = {b.kind: b for b in reversed(several)}
-        more = [followers(b, uv, moving, view, like)[0] for b in (lead, *(each[k] for k in each if k != lead.kind))]
+        more = [followers(b, paths, moving, view, like)[0] for b in (lead, *(each[k] for k in each if k != lead.kind))]
         if len(more[0]) < FEWEST:
             break
         both = np.unique(np.concatenate(more))
@@ -97,7 +98,8 @@ def sweep(
             break
     if found is None:
         return None
-    every, sight = view.sightings(uv[pool], np.arange(uv.shape[1])), view.sightings(uv[pool], keys)
+    every = view.sightings(paths[pool], np.arange(paths.uv.shape[1]))
+    sight = view.sightings(paths[pool], keys)
     starts: dict[str, list[Bundle]] = {}
     for b in found:
         first = starts.setdefault(b.kind, [])

@@ -14,7 +14,8 @@ from collections.abc import Callable
 import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo, Tracks
-from reconstruct.providers.affine import register
+from reconstruct.providers.affine import SPREAD, register
+from reconstruct.providers.shade import one_colour
 from reconstruct.video import Video
 
 WINDOW = 15
@@ -24,6 +25,8 @@ ANCHOR_PX = 2.0
 """How far re-registration against the anchor may move a point before the anchor counts as outdated, working px."""
 ALIKE, STRETCH = 0.8, 2.0
 """Correlation with the anchor frame, and stretch of its neighbourhood, up to which it stays the anchor."""
+EDGE = 0.1
+"""Ratio of the structure tensor's eigenvalues below which errors along an edge pile up."""
 CHANGE_GREY = 18.0
 INNER_SEEDS, INNER_EVERY = 120, 3
 """Seeds in what changing pixels enclose, in every third reference frame."""
@@ -154,10 +157,42 @@ def track_points(
         done += 1
         if progress:
             progress(done / 2)
-    visible = np.isfinite(uv[..., 0])
-    return Tracks(
-        video.to_full(uv).astype(np.float32), visible, reference, ProviderInfo("lk", cv2.__version__, "Apache-2.0")
-    )
+    return Tracks(video.to_full(uv).astype(np.float32), np.isfinite(uv[..., 0]), reference,
+                  ProviderInfo("lk", cv2.__version__, "Apache-2.0"), slip_of(grey, uv),
+                  one_colour(video.frames, uv))  # fmt: skip
+
+
+def slip_of(grey: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """How far points may slide along the edges that they are on (the aperture problem).
+
+    The structure tensor of a window as wide as the registration's says by how much less a point is held along one
+    direction than across it. White noise alone would make the standard deviations go with the root of the
+    eigenvalues; as errors pile up from anchor to anchor, they grow faster on edges (docs/notes/joint.md).
+
+    Args:
+        grey: (T, h, w) uint8.  uv: (N, T, 2) px of these, NaN where not seen.
+
+    Returns:
+        (N, T, 2) float32 as in :class:`Tracks`, 0 where not seen.
+    """
+    import cv2
+
+    out = np.zeros(uv.shape, np.float32)
+    h, w = grey.shape[1:]
+    for t, picture in enumerate(grey):
+        seen = np.flatnonzero(np.isfinite(uv[:, t, 0]))
+        if not len(seen):
+            continue
+        x, y = np.round(uv[seen, t]).astype(int).T
+        x, y = x.clip(0, w - 1), y.clip(0, h - 1)
+        gx, gy = (cv2.Scharr(picture, cv2.CV_32F, *d) for d in ((1, 0), (0, 1)))
+        a, b, c = (cv2.GaussianBlur(g, (0, 0), SPREAD)[y, x] for g in (gx * gx, gx * gy, gy * gy))
+        half, mean = np.hypot((a - c) / 2, b), (a + c) / 2
+        share = np.clip(mean - half, 0, None) / np.maximum(mean + half, 1e-6)
+        worth = np.sqrt(share) * np.minimum(1, share / EDGE)
+        along = 0.5 * np.arctan2(2 * b, a - c) + np.pi / 2
+        out[seen, t] = np.sqrt(1 - worth)[:, None] * np.stack([np.cos(along), np.sin(along)], axis=-1)
+    return out
 
 
 def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:

@@ -66,7 +66,8 @@ def same(a, b) -> bool:
 
 
 def test_every_dataclass_survives_the_disk(tmp_path, hands, fit):
-    tracks = Tracks(RNG.random((9, T, 2)), RNG.random((9, T)) > 0.5, np.zeros(9, int), MAKER)
+    tracks = Tracks(RNG.random((9, T, 2)), RNG.random((9, T)) > 0.5, np.zeros(9, int), MAKER, RNG.random((9, T, 2)) / 2,
+                    RNG.random(9) > 0.5)  # fmt: skip
     masks = LinkMasks(hands.mask, ~hands.mask, hands.mask, np.ones(T))
     geometry = Geometry(box(0), box(1), {"mass": {"value": 1.0, "origin": "assumed"}}, ("a note",))
     reference = HandReference(np.arange(T) / 30, np.zeros(T), np.zeros((T, 21, 3)), np.ones(T, bool), np.ones(T, bool),

@@ -11,6 +11,7 @@ from reconstruct.joint.bundle import State, refine, solve_depths
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.models import joint_transform
+from reconstruct.joint.paths import Paths
 from reconstruct.joint.select import _tilted_back, key_frames, observations
 from tests.reconstruct.joint_scenes import H, W, make_scene, make_video, project
 
@@ -71,7 +72,7 @@ def test_of_several_hinges_the_one_that_fits_is_taken():
                        size=[[-0.25, 0.25], [-0.3, 0], [-0.02, 0.02]], noise=0.15)  # fmt: skip
     uv = np.asarray(scene.tracks.uv, float)[:90] - [(W - 1) / 2, (H - 1) / 2]
     frames = key_frames(uv)
-    obs, ids = observations(uv, 768.0, np.zeros(2), frames, 90, np.random.default_rng(0), float(np.hypot(W, H)))
+    obs, ids = observations(Paths(uv), 768.0, np.zeros(2), frames, 90, np.random.default_rng(0), float(np.hypot(W, H)))
     foot = scene.point - scene.axis * (scene.axis @ scene.point)
     start = State("revolute", scene.axis, foot / np.linalg.norm(foot), scene.q[frames] - scene.q[frames[0]],
                   np.ones(len(obs.ref)))  # fmt: skip
@@ -79,7 +80,7 @@ def test_of_several_hinges_the_one_that_fits_is_taken():
     twin = refine(_tilted_back(right, obs), obs, scales=(4.0, 2.0), iterations=20)
 
     def error_deg(*starts):
-        done = finish({"revolute": [(s, obs) for s in starts]}, uv, ids, View(768.0))
+        done = finish({"revolute": [(s, obs) for s in starts]}, Paths(uv), ids, View(768.0))
         return np.degrees(np.arccos(min(1.0, abs(done.bundle.twist.axis @ scene.axis))))
 
     assert error_deg(twin) > 10

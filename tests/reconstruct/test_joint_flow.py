@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reconstruct.joint.flow import CUT, Flow, candidates, flow_of, turning
+from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, Sightings, residuals
 from reconstruct.joint.twist import twist_of_joint
 
@@ -47,7 +48,7 @@ def test_the_common_path_is_found_where_it_turns_back_and_tracks_come_and_go():
     for track in uv:
         begin = rng.integers(0, 10)
         track[:begin], track[begin + 20 :] = np.nan, np.nan
-    flow = flow_of(uv, FOCAL)
+    flow = flow_of(Paths(uv), FOCAL)
     assert flow is not None
     told = flow.path if np.corrcoef(flow.path, path)[0, 1] > 0 else 1 - flow.path
     assert np.abs(told - path).max() < 0.05
@@ -62,7 +63,7 @@ def test_the_joint_is_among_the_first(kind, axis, stroke):
     rng = np.random.default_rng(2)
     stray = rng.choice(len(uv), 40, replace=False)
     uv[stray] = uv[stray, :1] + (uv[stray] - uv[stray, :1]) * rng.uniform(-0.5, 1.5, (40, 1, 2))
-    flow = flow_of(uv, FOCAL)
+    flow = flow_of(Paths(uv), FOCAL)
     assert flow is not None
     found = candidates(flow, 10, 5)
     assert [c.cost for c in found] == sorted(c.cost for c in found)
@@ -82,12 +83,12 @@ def test_the_joint_is_among_the_first(kind, axis, stroke):
 
 def test_nothing_that_moves_is_no_flow():
     still = np.tile(np.random.default_rng(0).uniform(-200, 200, (40, 1, 2)), (1, 20, 1))
-    assert flow_of(still, FOCAL) is None
-    assert flow_of(still[:4], FOCAL) is None
+    assert flow_of(Paths(still), FOCAL) is None
+    assert flow_of(Paths(still[:4]), FOCAL) is None
 
 
 def test_a_track_of_few_frames_has_no_velocity():
     uv, *_ = tracks("prismatic", [1, 0, 0], 0.05, noise=0.05)
     uv[7, 4:] = np.nan
-    flow = flow_of(uv, FOCAL)
+    flow = flow_of(Paths(uv), FOCAL)
     assert isinstance(flow, Flow) and 7 not in flow.ids and len(flow.ids) == len(uv) - 1

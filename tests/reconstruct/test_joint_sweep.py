@@ -5,6 +5,7 @@ import pytest
 
 from reconstruct.joint.finish import View
 from reconstruct.joint.fit import moving_tracks
+from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import polish
 from reconstruct.joint.select import key_frames, observations
 from reconstruct.joint.sweep import sweep
@@ -32,7 +33,7 @@ def searched(scene, uv):
     seen = np.flatnonzero(np.isfinite(uv[..., 0]).any(1))
     moving = seen[np.linalg.norm(np.nanmax(uv[seen], axis=1) - np.nanmin(uv[seen], axis=1), axis=-1) > 4]
     keys = key_frames(uv[moving])
-    return moving, observations(uv[moving], FOCAL, np.zeros(2), keys, 260, np.random.default_rng(0),
+    return moving, observations(Paths(uv[moving]), FOCAL, np.zeros(2), keys, 260, np.random.default_rng(0),
                                 float(np.hypot(W, H)))[0]  # fmt: skip
 
 
@@ -46,13 +47,13 @@ def searched(scene, uv):
 def test_no_guess_is_needed(kind, axis, stroke, strays):
     scene, uv, link = small_motion(kind, axis, stroke, strays, 3)
     moving, obs = searched(scene, uv)
-    found = sweep(uv, moving, obs, moving, [], View(FOCAL))
+    found = sweep(Paths(uv), moving, obs, moving, [], View(FOCAL))
     assert found is not None
     # Of the sliding points hardly any is left; most of the link's are there.
     assert link[found.ids].mean() > 0.9 and link[found.ids].sum() > 0.7 * link[moving].sum()
     first = found.starts[kind][0]  # which type it is, is not the sweep's to say: a slide is a hinge far away
     assert first.q.shape == (uv.shape[1],)
-    best = polish(first, View(FOCAL).sightings(uv[found.ids], np.arange(uv.shape[1])))
+    best = polish(first, View(FOCAL).sightings(Paths(uv[found.ids]), np.arange(uv.shape[1])))
     assert best.sigma < 0.12
     assert np.degrees(np.arccos(min(1.0, abs(best.twist.axis @ scene.axis)))) < 3
 
@@ -60,5 +61,5 @@ def test_no_guess_is_needed(kind, axis, stroke, strays):
 def test_too_few_tracks_are_no_joint():
     scene, uv, _ = small_motion("revolute", [1, 0.1, 0.15], 0.17, 0, 2)
     moving, obs = searched(scene, uv)
-    assert sweep(uv, moving[:6], obs, moving[:6], [], View(FOCAL)) is None
+    assert sweep(Paths(uv), moving[:6], obs, moving[:6], [], View(FOCAL)) is None
     assert len(moving_tracks(scene.video, scene.tracks))

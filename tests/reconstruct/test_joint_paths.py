@@ -1,0 +1,173 @@
+"""Points on edges: what slides along them counts for nothing, what goes across counts in full."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reconstruct.cues import Hands, ProviderInfo
+from reconstruct.joint.finish import View
+from reconstruct.joint.fit import _stay, moving_tracks
+from reconstruct.joint.models import JointFit
+from reconstruct.joint.paths import Paths, held
+from reconstruct.joint.polish import Reach, normal_equations, place_points, polish, positions, residuals
+from reconstruct.pipeline import joint_off_the_arm
+from reconstruct.providers.lk_tracks import slip_of
+from reconstruct.providers.shade import one_colour
+from tests.reconstruct.joint_scenes import make_scene
+from tests.reconstruct.test_joint_polish import FOCAL, scene
+
+
+def on_edges(s, slide_px=6.0, seed=0):
+    """The sightings with every point on an edge of its own direction, along which the track wanders off."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, np.pi, len(s.uv))
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
+    walk = np.cumsum(rng.normal(size=s.seen.shape), axis=1)
+    walk *= slide_px / np.abs(walk).max(1, keepdims=True)
+    slip = np.sqrt(1 - 0.01) * np.broadcast_to(along, s.uv.shape)
+    return replace(s, uv=s.uv + walk[..., None] * along, slip=slip)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0, 2 * np.pi), st.floats(0, 1), st.floats(-9, 9), st.floats(-9, 9))
+def test_what_lies_along_the_slip_counts_by_what_it_is_worth(angle, worth, a, b):
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    r = (a * along + b * across)[None, None]
+    slip = np.sqrt(1 - worth) * along[None, None]
+    np.testing.assert_allclose(held(r, slip)[0, 0], worth * a * along + b * across, atol=1e-9)
+    # Derivatives are reduced alike, column by column.
+    np.testing.assert_allclose(held(np.stack([r, 2 * r], axis=-1), slip)[..., 1], 2 * held(r, slip), atol=1e-9)
+    assert held(r, None) is r
+
+
+def test_what_slides_along_a_resting_edge_does_not_move():
+    uv = np.zeros((3, 20, 2)) + 100.0
+    uv[:, :, 1] += np.linspace(0, 30, 20)  # all three go 30 px down
+    slip = np.zeros_like(uv)
+    slip[0, :, 1] = np.sqrt(0.99)  # an upright edge
+    slip[1, :, 0] = np.sqrt(0.99)  # a level one
+    slip[2, :, 1] = np.sqrt(0.5)  # a corner, worse one way
+    uv[1, :4] = np.nan
+    way = np.linalg.norm(np.ptp(Paths(uv, slip).moved()[:, 4:], axis=1), axis=1)
+    assert way[0] < 2 and way[1] > 20 and way[2] == pytest.approx(way[1] / 2, rel=1e-6)
+    assert Paths(uv).moved() is uv
+
+
+def test_an_axis_from_points_that_slide_along_edges():
+    truth, s = scene("revolute", points=120, noise=0.1)
+    slid = on_edges(s)
+    start = replace(truth, q=truth.q * 0.9)
+    off = {}
+    for name, seen in (("told", slid), ("not told", replace(slid, slip=None))):
+        axis = polish(place_points(start, seen), seen, iterations=30).twist.axis
+        off[name] = np.degrees(np.arccos(min(1.0, abs(axis @ truth.twist.axis))))
+    assert off["told"] < 0.5
+    assert off["not told"] > 5 * off["told"]
+
+
+def test_derivatives_of_the_bundle_adjustment_on_edges():
+    truth, s = scene("revolute", points=20, frames=10)
+    s = on_edges(s)
+    world, cam = positions(truth, s)
+    n = normal_equations(truth, s, world, cam, residuals(truth, s, cam), s.seen.astype(float))
+    cost = lambda b: 0.5 * np.sum(residuals(b, s) ** 2)  # noqa: E731
+    h = 1e-6
+    for k in range(n.Z.shape[1]):
+        up, down = (replace(truth, twist=truth.twist.moved(e * h * n.Z[:, k], "revolute")) for e in (1, -1))
+        assert (cost(up) - cost(down)) / (2 * h) == pytest.approx(n.g[k], rel=1e-3, abs=0.1)
+    X = truth.X.copy()
+    X[3, 2] += h
+    assert (cost(replace(truth, X=X)) - cost(truth)) / h == pytest.approx(n.gp[3, 2], rel=1e-3, abs=0.1)
+
+
+def test_sightings_keep_the_slip_of_their_tracks():
+    rng = np.random.default_rng(0)
+    paths = Paths(rng.uniform(-100, 100, (6, 9, 2)), rng.uniform(-0.5, 0.5, (6, 9, 2)))
+    frames, rows = np.array([1, 4, 7]), np.array([5, 2])
+    s = View(FOCAL).sightings(paths[rows], frames)
+    np.testing.assert_array_equal(s.slip, paths.slip[rows][:, frames])
+    np.testing.assert_array_equal(s.of(np.array([False, True])).slip[0], paths.slip[2][frames])
+
+
+def test_a_point_may_lie_anywhere_in_reach_and_is_called_back_from_beyond():
+    truth, s = scene("revolute")
+    reach = Reach.of(truth, s, 0.5)
+    assert reach.weight > 0 and reach.cost(truth.X) == 0
+    X = truth.X.copy()
+    X[7] += [0.0, 0.0, 3 * reach.radius]
+    H, g = reach.slopes(X)
+    assert not g[:7].any() and not H[8:].any()
+    h = 1e-6
+    for k in range(3):
+        step = np.zeros_like(X)
+        step[7, k] = h
+        assert (reach.cost(X + step) - reach.cost(X - step)) / (4 * h) == pytest.approx(g[7, k], rel=1e-4, abs=1e-6)
+    assert np.linalg.eigvalsh(H[7]).min() > -1e-9
+
+
+def plain_door(count=16):
+    """(count, h, w, 3) of an evenly painted quadrilateral that goes 2 px a frame to the right before an even wall."""
+    frames = []
+    rng = np.random.default_rng(0)
+    for t in range(count):
+        f = np.full((240, 320, 3), 180.0)
+        shape = np.array([[80 + 2 * t, 50], [170 + 2 * t, 50], [170 + 2 * t, 190], [80 + 2 * t, 190]], np.int32)
+        cv2.fillConvexPoly(f, shape, (60.0, 110.0, 90.0))
+        frames.append(np.clip(cv2.GaussianBlur(f, (0, 0), 1.0) + rng.normal(scale=1.0, size=f.shape), 0, 255))
+    return np.stack(frames).astype(np.uint8)
+
+
+def test_an_edge_slips_along_itself_and_a_corner_does_not():
+    grey = np.stack([cv2.cvtColor(f, cv2.COLOR_BGR2GRAY) for f in plain_door(1)])
+    slip = slip_of(grey, np.array([[[80.0, 120.0]], [[120.0, 50.0]], [[80.0, 50.0]], [[np.nan, np.nan]]]))[:, 0]
+    assert abs(slip[0, 1]) > 0.98 and abs(slip[0, 0]) < 0.1
+    assert abs(slip[1, 0]) > 0.98 and abs(slip[1, 1]) < 0.1
+    assert np.linalg.norm(slip[2]) < 0.75
+    assert not slip[3].any()
+
+
+def test_a_shadows_edge_has_one_colour_on_both_sides_and_a_rim_has_two():
+    frame = np.zeros((200, 300, 3), float) + [180.0, 170.0, 150.0]
+    frame[:, 100:] *= 0.6  # in the shade
+    frame[100:, 200:] = [60.0, 110.0, 90.0]  # a part in the shade
+    frame[:, :50] *= 0.95  # fainter than any shadow
+    noisy = np.random.default_rng(0).normal(scale=1.5, size=(5, *frame.shape)) + frame
+    frames = np.clip(noisy, 0, 255).astype(np.uint8)
+    at = np.array([[100.0, 60.0], [200.0, 150.0], [50.0, 60.0], [np.nan, np.nan]])
+    uv = np.repeat(at[:, None], 5, axis=1)
+    uv[0, :2] = np.nan
+    assert one_colour(frames, uv).tolist() == [True, False, False, False]
+
+
+def test_shadows_edges_are_left_out_where_enough_else_moves(monkeypatch):
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    moving = moving_tracks(scene.video, scene.tracks)
+    asked = []
+
+    def asked_of(video, tracks, *args, **kwargs):
+        asked.append(tracks.visible.any(1))
+        return JointFit("refused", "no")
+
+    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", asked_of)
+    nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
+    for many in (20, len(moving) - 10):
+        shade = np.zeros(len(scene.tracks.uv), bool)
+        shade[moving[:many]] = True
+        fit = joint_off_the_arm(scene.video, replace(scene.tracks, shade=shade), nobody, None, 0, lambda _: None)
+        assert fit.verdict == "refused"
+    # Without them, then with them since that was refused; and all at once where ten would be left.
+    assert len(asked) == 3 and not asked[0][moving[:20]].any()
+    assert asked[1].sum() == asked[0].sum() + 20 and asked[2][moving].all()
+
+
+def test_a_point_that_slid_off_is_not_handed_on():
+    truth, s = scene("revolute", points=40, noise=0.1)
+    slid = on_edges(s)
+    some = replace(s, uv=np.where(np.arange(40)[:, None, None] < 25, s.uv, slid.uv), slip=slid.slip)
+    assert _stay(truth, some)[:25].all() and _stay(truth, some)[25:].mean() < 0.5
+    far = replace(s, uv=s.uv + 50.0)
+    assert _stay(truth, far).all()
