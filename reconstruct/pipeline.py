@@ -31,6 +31,8 @@ ARM_SHARE = 0.2
 LIT_TRACKS, LIT_SHARE = 40, 0.5
 """What has to be left of the tracks that move for those on edges of brightness alone to be left out. Where most are on
 such edges the world is grey, and they say nothing of shadows (three real clips: 68 to 76 %)."""
+SHADOWS = 0.75
+"""Share of the tracks that follow a joint from which on it is a shadow's."""
 
 
 class Progress(Protocol):
@@ -319,11 +321,24 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     fit = fit_joint(video, lit, focal, seed, progress, camera_moving=False)
     if fit.verdict == "refused" and lit is not rest:
         fit = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
+    fit = _unless_a_shadow(fit, tracks)
     if fit.verdict == "refused" and share >= ARM_SHARE:
-        again = fit_joint(video, tracks, focal, seed, progress, camera_moving=False)
+        again = _unless_a_shadow(fit_joint(video, tracks, focal, seed, progress, camera_moving=False), tracks)
         return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
+
+
+def _unless_a_shadow(fit: JointFit, tracks: Tracks) -> JointFit:
+    """The joint, or a refusal where nearly all that follows it is the edge of a shadow: one that a waving hand casts
+    slides over a table as exactly as a drawer."""
+    if fit.verdict == "refused" or tracks.shade is None:
+        return fit
+    cast = int(tracks.shade[fit.point_track].sum())
+    if cast < SHADOWS * len(fit.point_track):
+        return fit
+    reason = f"what moves is a shadow: {cast} of the {len(fit.point_track)} tracks that agree lie on the edge of one"
+    return JointFit("refused", reason, tracks=fit.tracks, inliers=fit.inliers)
 
 
 def _off_shadows(video: Video, tracks: Tracks) -> Tracks:

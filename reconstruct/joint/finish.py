@@ -65,6 +65,10 @@ NO_SCREW = 1e-3
 """A thread less probable than this in the first round is not looked at again: the hinge is its special case."""
 
 
+class NoLink(Exception):
+    """The points of the tracks are no one body by any type: too few are before the camera and near each other."""
+
+
 @dataclass(frozen=True)
 class Rival:
     """Another axis of the same type that explains the motion too: how far off it is, and its probability."""
@@ -185,6 +189,9 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         view: focal length and camera.
         still: the resting scene, where the camera moves and its path in `view` is but an estimate: it is refined
             together with the joint, whose uncertainty then holds the camera's.
+
+    Raises:
+        NoLink: fewer than MIN_COMMON points make sense as those of one link.
     """
     T = paths.uv.shape[1]
     some = _spread_out(T, MOST_FRAMES if still is None else COARSE_FRAMES)
@@ -206,6 +213,8 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     keep = np.logical_and.reduce(sane)
     if keep.sum() < max(MIN_COMMON, 0.8 * max(s.sum() for s in sane)):
         keep = sane[int(np.argmin([b.cost for b in best.values()]))]
+    if keep.sum() < MIN_COMMON:
+        raise NoLink
     members = ids[pick[keep]]
     sight = sight.of(keep)
     best = {kind: replace(b, X=b.X[keep]) for kind, b in best.items()}

@@ -11,7 +11,17 @@ from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import bridged, free_motion, looser
-from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, Starts, Still, View, bundle_of_state, finish, turn_deg
+from reconstruct.joint.finish import (
+    SCREW_TURN_DEG,
+    Finished,
+    NoLink,
+    Starts,
+    Still,
+    View,
+    bundle_of_state,
+    finish,
+    turn_deg,
+)
 from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
@@ -26,6 +36,7 @@ from reconstruct.joint.select import (
     observations,
     search,
 )
+from reconstruct.joint.slight import slight_motion
 from reconstruct.joint.sweep import SMALL, sweep
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
@@ -47,6 +58,7 @@ LIKELY = 0.1
 """Probability of another axis, or type, from which on the answer is not called certain."""
 VAGUE_DEG = 10.0
 """Standard deviation of an axis beyond which the joint is not called certain."""
+NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
@@ -116,8 +128,24 @@ def fit_joint(
         if fit.inliers == 0:
             break  # this was no bad luck: there is nothing to draw from
     assert answer is not None
+    if answer.verdict == "refused" and answer.inliers < MIN_INLIERS and video.warp is None:
+        answer = _slight(video, paths - camera.centre, camera, view, known) or answer
     tell(1.0)
     return answer
+
+
+def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None) -> JointFit | None:
+    """The joint of a motion of few pixels, or None if there is none to believe; px from the principal point."""
+    if (found := slight_motion(paths, view)) is None:
+        return None
+    try:
+        done = finish(found[0], paths, found[1], view)
+    except NoLink:
+        return None
+    if _why_not_believed(done, _restlessness(paths, camera, 0.5)):
+        return None
+    full, std = camera.focal / video.scale, KNOWN_STD if known else None
+    return _result(video, done, full, len(paths), "; the motion is slight", std)
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
@@ -143,13 +171,16 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
     if found.refusal:
         return JointFit("refused", found.refusal, tracks=len(paths), inliers=len(found.members)), found.explained
     tell(0.9)
-    if video.warp is None:
-        restless = _restlessness(paths, camera, 0.5)
-        starts, members = _sharpened(found, paths - camera.centre, view, camera)
-        done = finish(starts, paths - camera.centre, members, view)
-    else:
-        done, restless, words = _hand_held(found, paths, video.warp, view, camera)
-        note += words
+    try:
+        if video.warp is None:
+            restless = _restlessness(paths, camera, 0.5)
+            starts, members = _sharpened(found, paths - camera.centre, view, camera)
+            done = finish(starts, paths - camera.centre, members, view)
+        else:
+            done, restless, words = _hand_held(found, paths, video.warp, view, camera)
+            note += words
+    except NoLink:
+        return JointFit("refused", NO_LINK, tracks=len(paths), inliers=len(found.members)), found.explained
     if reason := _why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members)), found.explained
     full = camera.focal / video.scale
@@ -336,7 +367,10 @@ def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, se
     starts = joints_between(static, link)
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])
-    done = finish({k: [b] for k, b in starts.items()}, paths, np.flatnonzero(link.members), view, still)
+    try:
+        done = finish({k: [b] for k, b in starts.items()}, paths, np.flatnonzero(link.members), view, still)
+    except NoLink:
+        return JointFit("refused", NO_LINK, tracks=len(paths), inliers=int(link.members.sum()))
     if reason := _why_not_believed(done):
         return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members))
     note = "; the camera moves: its path is fitted together with the joint"

@@ -108,15 +108,39 @@ def flow_of(paths: Paths, focal: float) -> Flow | None:
     return Flow(enough[good], along[good, 0] / focal, along[good, 1] / focal, cov[good], path)
 
 
-def _common_path(uv: np.ndarray, seen: np.ndarray, rounds: int = 8) -> np.ndarray | None:
-    """(T,) in [0, 1]: tracks as a place plus a velocity times this, robustly, from the longest track on."""
-    m, x, T = seen.astype(float), np.nan_to_num(uv), uv.shape[1]
+SPEAK = 0.02
+"""Weight of the tracks seen in a frame over the most of any frame, from which on it has a say."""
+STARTS = 8
+"""Tracks whose own path is tried as that of all."""
+
+
+def _common_path(uv: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
+    """(T,) in [0, 1]: tracks as a place plus a velocity times this, robustly.
+
+    From the longest track that goes far, which may be one that goes its own way, and from others of the longer half;
+    that counts which leaves the least.
+    """
+    m, x = seen.astype(float), np.nan_to_num(uv)
     centred = (x - (np.sum(x, axis=1) / m.sum(1)[:, None])[:, None]) * m[..., None]
     spread, ways = np.linalg.eigh(np.einsum("nti,ntj->nij", centred, centred) / m.sum(1)[:, None, None])
     far = np.sqrt(spread[:, 1])
-    first = int(np.argmax(m.sum(1) * np.minimum(far, np.quantile(far, 0.9))))
-    here = np.flatnonzero(seen[first])
-    path = np.interp(np.arange(T), here, centred[first, here] @ ways[first, :, 1])
+    long = np.flatnonzero(m.sum(1) >= np.median(m.sum(1)))
+    spaced = long[np.argsort(far[long])][np.linspace(0, len(long) - 1, STARTS).round().astype(int)]
+    tries = []
+    for first in (int(np.argmax(m.sum(1) * np.minimum(far, np.quantile(far, 0.9)))), *spaced):
+        here = np.flatnonzero(seen[first])
+        start = np.interp(np.arange(uv.shape[1]), here, centred[first, here] @ ways[first, :, 1])
+        if (found := _settled(start, x, m)) is not None:
+            tries.append(found)
+    if not tries:
+        return None
+    scale = min(np.median(r2) for _, r2 in tries)
+    return min(tries, key=lambda found: float(np.sum(m.sum(1) * found[1] / (found[1] + scale))))[0]
+
+
+def _settled(path: np.ndarray, x: np.ndarray, m: np.ndarray, rounds: int = 8) -> tuple[np.ndarray, np.ndarray] | None:
+    """A start for the common path (T,) brought to its optimum, and (N,) mean squares that it leaves of the tracks."""
+    T = len(path)
     for _ in range(rounds):
         if np.ptp(path) < 1e-9:
             return None
@@ -128,9 +152,10 @@ def _common_path(uv: np.ndarray, seen: np.ndarray, rounds: int = 8) -> np.ndarra
         w = m / (1 + r2 / np.median(r2))[:, None] ** 2
         top = np.einsum("nt,ntk,nk->t", w, x - line[:, :1], line[:, 1])
         weight = np.einsum("nt,nk,nk->t", w, line[:, 1], line[:, 1])
-        told = np.flatnonzero(weight > 1e-6 * weight.max())
+        # Frames in which only strays are seen say nothing.
+        told = np.flatnonzero((weight > 1e-6 * weight.max()) & (w.sum(0) > SPEAK * w.sum(0).max()))
         path = np.interp(np.arange(T), told, top[told] / weight[told])
-    return (path - path.min()) / np.ptp(path)
+    return (path - path.min()) / np.ptp(path), r2
 
 
 def candidates(flow: Flow, hinges: int, slides: int) -> list[Candidate]:

@@ -449,9 +449,10 @@ def regauged(b: Bundle, s: Sightings) -> Bundle:
     Nothing in the pictures of a resting camera holds the scale, and steps along it carry the link away from the anchor;
     seen from far off every twist looks the same, and the steps stall.
     """
-    if s.R is not None or s.free:
+    tw, unit = b.twist, float(np.median(b.X[:, 2]))
+    # A link behind the camera has no depth to be brought to 1.
+    if s.R is not None or s.free or unit <= 1e-9:
         return b
-    tw, unit = b.twist, max(float(np.median(b.X[:, 2])), 1e-9)
     away = anchor_of(b.kind, b.X, tw.axis, tw.anchor if b.kind == "prismatic" else tw.point)
     size = float(np.linalg.norm(np.quantile(b.X, 0.9, axis=0) - np.quantile(b.X, 0.1, axis=0)))
     if abs(np.log(unit)) < GAUGE and np.linalg.norm(tw.anchor - away) < max(size, 1e-9):

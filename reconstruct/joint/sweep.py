@@ -81,7 +81,7 @@ def sweep(
             break
         pick = good[_evenly(len(good), TRACKS)]
         sight = view.sightings(paths[pool[flow.ids[pick]]], keys, lasting=100.0)
-        several = _narrowed([_start(c, flow, pick, keys) for c in ways] + [_placed(b, sight) for b in field], sight)
+        several = _narrowed([start_of(c, flow, pick, keys) for c in ways] + [_placed(b, sight) for b in field], sight)
         lead = several[0]
         if found is not None and lead.sigma > SHARPER * found[0].sigma:
             break
@@ -113,7 +113,7 @@ def _evenly(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _start(c: Candidate, flow: Flow, pick: np.ndarray, keys: np.ndarray) -> Bundle:
+def start_of(c: Candidate, flow: Flow, pick: np.ndarray, keys: np.ndarray) -> Bundle:
     """The joint that has these velocities in the middle of the path, in the frames `keys`."""
     X = np.concatenate([flow.x[pick], np.ones((len(pick), 1))], axis=1) * c.depth[pick, None]
     anchor = np.median(X[c.good[pick]], axis=0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo, Tracks
 from reconstruct.providers.affine import SPREAD, register
-from reconstruct.providers.shade import one_colour
+from reconstruct.providers.shade import shadow_edges
 from reconstruct.video import Video
 
 WINDOW = 15
@@ -28,6 +28,8 @@ ALIKE, STRETCH = 0.8, 2.0
 EDGE = 0.1
 """Ratio of the structure tensor's eigenvalues below which errors along an edge pile up."""
 CHANGE_GREY = 18.0
+SHADOW_PX = 2.0
+"""Extent of a track, working px, from which on it may be a shadow's."""
 INNER_SEEDS, INNER_EVERY = 120, 3
 """Seeds in what changing pixels enclose, in every third reference frame."""
 
@@ -159,7 +161,16 @@ def track_points(
             progress(done / 2)
     return Tracks(video.to_full(uv).astype(np.float32), np.isfinite(uv[..., 0]), reference,
                   ProviderInfo("lk", cv2.__version__, "Apache-2.0"), slip_of(grey, uv),
-                  one_colour(video.frames, uv))  # fmt: skip
+                  _shadows(video, uv, covered))  # fmt: skip
+
+
+def _shadows(video: Video, uv: np.ndarray, covered: np.ndarray | None) -> np.ndarray:
+    """(N,) bool as in :class:`Tracks`; asked of what moves only."""
+    out = np.zeros(len(uv), bool)
+    extent = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)
+    moves = np.flatnonzero(extent > SHADOW_PX)
+    out[moves] = shadow_edges(video.frames, uv[moves], covered)
+    return out
 
 
 def slip_of(grey: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import Reach, normal_equations, place_points, polish, positions, residuals
 from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
-from reconstruct.providers.shade import one_colour
+from reconstruct.providers.shade import one_colour, rest_beneath, shadow_edges
 from tests.reconstruct.joint_scenes import make_scene
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
@@ -141,6 +141,46 @@ def test_a_shadows_edge_has_one_colour_on_both_sides_and_a_rim_has_two():
     uv = np.repeat(at[:, None], 5, axis=1)
     uv[0, :2] = np.nan
     assert one_colour(frames, uv).tolist() == [True, False, False, False]
+
+
+def passing(dark, count=7):
+    """(count, h, w, 3) of a darker half that comes in from the left over grain, and (1, count, 2) px on its edge.
+
+    Args:
+        dark: of a picture, what it looks like within.
+    """
+    rng = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(rng.normal(scale=3.5, size=(200, 300)), (0, 0), 2.0)[..., None]
+    wall = np.array([110.0, 105.0, 95.0]) * np.exp(np.clip(grain, -0.8, 0.8))
+    frames, edge = [], np.array([[[60.0 + 30 * t, 100.0] for t in range(count)]])
+    for x in edge[0, :, 0]:
+        f = wall.copy()
+        f[:, : int(x)] = dark(f)[:, : int(x)]
+        frames.append(f + rng.normal(scale=1.0, size=f.shape))
+    return np.clip(np.stack(frames), 0, 255).astype(np.uint8), edge
+
+
+def test_under_a_shadow_the_grain_stays_and_under_a_part_of_that_colour_it_does_not():
+    frames, edge = passing(lambda wall: 0.55 * wall)
+    assert one_colour(frames, edge).all() and rest_beneath(frames, edge) > 0.9 and shadow_edges(frames, edge).all()
+    # Under a hand at all other times nothing is known of the place.
+    assert rest_beneath(frames, edge, np.ones(frames.shape[:3], bool)) == 0
+    frames, edge = passing(lambda wall: np.zeros_like(wall) + 0.35 * np.array([110.0, 105.0, 95.0]))
+    assert one_colour(frames, edge).all() and rest_beneath(frames, edge) < 0.2
+    assert not shadow_edges(frames, edge).any()
+
+
+def test_a_joint_that_shadows_alone_follow_is_none(monkeypatch):
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    shade = np.zeros(len(scene.tracks.uv), bool)
+    shade[:30] = True
+    nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
+    for ids, verdict in ((np.arange(35), "refused"), (np.arange(45), "ok")):
+        monkeypatch.setattr("reconstruct.joint.fit.fit_joint",
+                            lambda *_, ids=ids, **__: JointFit("ok", "made", "prismatic", point_track=ids))  # fmt: skip
+        fit = joint_off_the_arm(scene.video, replace(scene.tracks, shade=shade), nobody, None, 0, lambda _: None)
+        assert fit.verdict == verdict
+        assert fit.reason.startswith("what moves is a shadow: 30 of the 35") == (verdict == "refused")
 
 
 def test_shadows_edges_are_left_out_where_enough_else_moves(monkeypatch):
