@@ -10,9 +10,8 @@ import numpy as np
 from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
-from reconstruct.joint.evidence import bridged, free_motion, looser
+from reconstruct.joint.evidence import free_motion
 from reconstruct.joint.finish import (
-    SCREW_TURN_DEG,
     Finished,
     NoLink,
     Starts,
@@ -20,13 +19,12 @@ from reconstruct.joint.finish import (
     View,
     bundle_of_state,
     finish,
-    turn_deg,
 )
 from reconstruct.joint.groups import two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
-from reconstruct.joint.polish import Bundle, Sightings, positions, residuals
+from reconstruct.joint.result import MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
     explained,
@@ -38,26 +36,16 @@ from reconstruct.joint.select import (
 )
 from reconstruct.joint.slight import slight_motion
 from reconstruct.joint.sweep import SMALL, sweep
-from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 
 MOVING_SHARE = 0.012
 """A track moves if its extent exceeds this share of the image diagonal."""
-MIN_INLIERS = 8
 SIMPLER = 1.05
 RIVAL, RIVALS = 0.9, 4
 """Hinges that explain this share of what the best one does are polished too, so many at most."""
-BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
-LOOSER, RESTLESS = 2.75, 3.0
-"""A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
-what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
 DEPTHS = 0.68
 """What the compensation of a moving camera leaves depends on the depth, and the link's own is not known: it is taken to
 be what this share of the resting points stays under, one standard deviation."""
-LIKELY = 0.1
-"""Probability of another axis, or type, from which on the answer is not called certain."""
-VAGUE_DEG = 10.0
-"""Standard deviation of an axis beyond which the joint is not called certain."""
 NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 DEFAULT_FOCAL = 0.8
@@ -70,9 +58,6 @@ FREE_SHARE = 1 / 4
 """A joint is refuted if this share of the points that move most follow a free rigid body but not the joint. Real hinges
 and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0 to 0.15; what is lifted away leaves
 0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
-
-SLID_PX = 2.0
-"""Working px, median, that a track may have slid along its edge for its point to be handed on."""
 
 TRIES = 3
 """Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
@@ -142,10 +127,10 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         done = finish(found[0], paths, found[1], view)
     except NoLink:
         return None
-    if _why_not_believed(done, _restlessness(paths, camera, 0.5)):
+    if why_not_believed(done, _restlessness(paths, camera, 0.5)):
         return None
     full, std = camera.focal / video.scale, KNOWN_STD if known else None
-    return _result(video, done, full, len(paths), "; the motion is slight", std)
+    return result_of(video, done, full, len(paths), "; the motion is slight", std)
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
@@ -181,10 +166,10 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
             note += words
     except NoLink:
         return JointFit("refused", NO_LINK, tracks=len(paths), inliers=len(found.members)), found.explained
-    if reason := _why_not_believed(done, restless):
+    if reason := why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members)), found.explained
     full = camera.focal / video.scale
-    return _result(video, done, full, len(paths), note, KNOWN_STD if known else None), found.explained
+    return result_of(video, done, full, len(paths), note, KNOWN_STD if known else None), found.explained
 
 
 def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:
@@ -371,144 +356,7 @@ def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, se
         done = finish({k: [b] for k, b in starts.items()}, paths, np.flatnonzero(link.members), view, still)
     except NoLink:
         return JointFit("refused", NO_LINK, tracks=len(paths), inliers=int(link.members.sum()))
-    if reason := _why_not_believed(done):
+    if reason := why_not_believed(done):
         return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members))
     note = "; the camera moves: its path is fitted together with the joint"
-    return _result(video, done, full_focal, len(paths), note, KNOWN_STD if view.focal_std == 0 else None)
-
-
-def _why_not_believed(done: Finished, restlessness: float = np.inf) -> str | None:
-    """A sentence if the finished joint is not one.
-
-    Args:
-        restlessness: px, what points at rest leave their place by.
-    """
-    turn = turn_deg(done.bundle)
-    if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
-        return (
-            f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any "
-            f"body does that is carried a short way (a screw is believed from {SCREW_TURN_DEG:.0f} deg on)"
-        )
-    b = bridged(done.bundle, done.sight)
-    if b.supported < BRIDGED_SHARE:
-        return f"too few tracks last through the motion: {1 - b.supported:.0%} of the stroke is seen by hardly any"
-    if b.error > BRIDGED_ERROR:
-        return (
-            f"no joint: from one state to the next the best one ({done.bundle.kind}) misses {b.error:.0%} of the way "
-            "that its own points go"
-        )
-    misses = done.bundle.sigma > RESTLESS * restlessness
-    times = looser(done.bundle, done.sight) if misses else None
-    if times is not None and times > LOOSER:
-        return (
-            f"the part moves as a free body: its points follow one {times:.2g} times more exactly than the best joint "
-            f"({done.bundle.kind})"
-        )
-    return None
-
-
-def _result(
-    video: Video, done: Finished, full_focal: float, tracks: int, note: str, focal_std: float | None
-) -> JointFit:
-    """World frame, signs, units and the contract's fields."""
-    b, sight, probability = done.bundle, done.sight, done.probability
-    world, cam = positions(b, sight)
-    seen = sight.seen
-    r = np.linalg.norm(residuals(b, sight, cam), axis=-1)[seen]
-    unit = float(np.median(cam[..., 2][seen]))
-    full_focal *= float(np.exp(b.log_focal))
-    turns = b.kind != "prismatic"
-    rate = float(np.linalg.norm(b.twist.curvature)) if turns else 1.0 / unit
-    q, axis = b.q * rate, b.twist.axis
-    far = int(np.argmax(np.abs(q)))
-    if q[far] < 0:
-        q, axis = -q, -axis
-    points, stay = b.X / unit, _stay(b, sight)
-    pivot, origin = None, np.median(points, axis=0)
-    if turns:
-        c = b.twist.point / unit
-        pivot = origin = c + axis * float(np.median((points - c) @ axis))
-    moved = world[:, far] / unit
-    up, how = assumed_up(b.kind, axis, points, moved)
-    T_world_camera = world_from_camera(up, axis, origin)
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    K = np.array([[full_focal, 0, (video.size[0] - 1) / 2], [0, full_focal, (video.size[1] - 1) / 2], [0, 0, 1.0]])
-    p = max(probability.values())
-    verdict, reason = "ok", f"{len(done.members)} tracks agree; {how}{note}"
-    if p < 1 - LIKELY:
-        verdict = "ambiguous"
-        names = " and ".join(sorted(probability, key=probability.get, reverse=True))
-        reason = (
-            f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}{note}"
-        )
-    sure = done.spread
-    if verdict == "ok" and sure.axis_deg > VAGUE_DEG:
-        verdict = "ambiguous"
-        reason = (
-            f"{len(done.members)} tracks hold the axis to {sure.axis_deg:.0f} deg only; a longer motion, or more of "
-            f"the part in view, would tell; {how}{note}"
-        )
-    rival, axis_deg = done.rival, sure.axis_deg
-    if rival is not None:
-        axis_deg = float(np.hypot(axis_deg, np.sqrt(rival.probability) * rival.apart_deg))
-    if verdict == "ok" and rival is not None and rival.probability > LIKELY:
-        verdict = "ambiguous"
-        reason = (
-            f"another axis, {rival.apart_deg:.0f} deg off, explains the motion almost equally well "
-            f"(p = {rival.probability:.2f}); a longer motion would tell; {how}{note}"
-        )
-    std = {"axis_deg": axis_deg, "point_m": sure.point, "q": sure.q,
-           "focal_px": full_focal * (sure.log_focal if focal_std is None else focal_std)}  # fmt: skip
-    fit = JointFit(
-        verdict,
-        reason,
-        b.kind,
-        probability,
-        R @ axis,
-        None if pivot is None else R @ pivot + t,
-        b.twist.pitch / unit if b.kind == "screw" else None,
-        q,
-        video.index,
-        K,
-        np.linalg.inv(T_world_camera),
-        (points @ R.T + t)[stay],
-        done.members[stay],
-        False,
-        "none",
-        std,
-        residual_px=float(np.median(r)) / video.scale,
-        inliers=len(done.members),
-        tracks=tracks,
-        moving_frames=_moving_frames(q, video.time),
-    )
-    return replace(fit, image_line=image_line(fit))
-
-
-def _stay(b: Bundle, s: Sightings) -> np.ndarray:
-    """(N,) bool: points whose tracks stayed on them; all of them where hardly any did. What slides along an edge has a
-    say in the joint, but is in no one place of the link."""
-    off = np.linalg.norm(residuals(b, replace(s, slip=None)), axis=-1)
-    out = np.zeros(len(off), bool)
-    some = s.seen.any(1)
-    out[some] = np.nanmedian(np.where(s.seen, off, np.nan)[some], axis=1) < SLID_PX
-    return out if out.sum() >= MIN_INLIERS else np.ones(len(off), bool)
-
-
-def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """(T,) frames in which |dq/dt| exceeds 4 % of the range a second, and 10 % of its upper quartile."""
-    rate = np.abs(np.gradient(q, time))
-    return rate > max(0.04 * np.ptp(q), 0.1 * np.quantile(rate, 0.95))
-
-
-def image_line(fit: JointFit) -> np.ndarray:
-    """(2, 2) full px: the axis along the link's extent, or the slide from its start to its far end."""
-    if fit.type == "prismatic":
-        start = np.median(fit.points, axis=0)
-        ends = np.stack([start, start + fit.axis * fit.q[int(np.argmax(np.abs(fit.q)))]])
-    else:
-        along = (fit.points - fit.point) @ fit.axis
-        lo, hi = np.quantile(along, [0.05, 0.95])
-        if hi - lo < 1e-6:
-            lo, hi = lo - 0.02, hi + 0.02
-        ends = fit.point + np.outer([lo, hi], fit.axis)
-    return fit.project(ends)
+    return result_of(video, done, full_focal, len(paths), note, KNOWN_STD if view.focal_std == 0 else None)

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from reconstruct.cues import Hands, ProviderInfo
 from reconstruct.joint.finish import View
-from reconstruct.joint.fit import _stay, moving_tracks
+from reconstruct.joint.fit import moving_tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import Reach, normal_equations, place_points, polish, positions, residuals
+from reconstruct.joint.result import stay
 from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
 from reconstruct.providers.shade import one_colour, rest_beneath, shadow_edges
@@ -208,6 +209,6 @@ def test_a_point_that_slid_off_is_not_handed_on():
     truth, s = scene("revolute", points=40, noise=0.1)
     slid = on_edges(s)
     some = replace(s, uv=np.where(np.arange(40)[:, None, None] < 25, s.uv, slid.uv), slip=slid.slip)
-    assert _stay(truth, some)[:25].all() and _stay(truth, some)[25:].mean() < 0.5
+    assert stay(truth, some)[:25].all() and stay(truth, some)[25:].mean() < 0.5
     far = replace(s, uv=s.uv + 50.0)
-    assert _stay(truth, far).all()
+    assert stay(truth, far).all()

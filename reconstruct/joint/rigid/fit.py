@@ -343,7 +343,7 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
     fit = JointFit(verdict, reason, kind, probability, axis, point, pitch, q, np.arange(T), obs.K, T_camera_world,
                    points, np.flatnonzero(link), metric, "depth" if metric else "none", std, None,
                    float(np.median(px)) if len(px) else None, inliers, len(obs.link), _moves(q))  # fmt: skip
-    from reconstruct.joint.fit import image_line
+    from reconstruct.joint.result import image_line
 
     return replace(fit, image_line=image_line(fit))
 
