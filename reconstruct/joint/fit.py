@@ -20,7 +20,7 @@ from reconstruct.joint.finish import (
     bundle_of_state,
     finish,
 )
-from reconstruct.joint.groups import two_bodies
+from reconstruct.joint.groups import Rigid, two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
@@ -46,7 +46,10 @@ RIVAL, RIVALS = 0.9, 4
 DEPTHS = 0.68
 """What the compensation of a moving camera leaves depends on the depth, and the link's own is not known: it is taken to
 be what this share of the resting points stays under, one standard deviation."""
+STROKE_STDS = 8.0
+"""Stroke over a state's standard deviation up to which two groups of tracks before a moving camera are one body."""
 NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
+NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
@@ -341,14 +344,24 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
 
 
 def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, seed: int) -> JointFit | None:
-    """The joint between the two largest rigid groups of tracks, px from the principal point.
+    """The joint between the two largest rigid groups of tracks that move against each other; px from the principal
+    point. None if there are no two groups.
 
-    None if there are no two groups.
+    Tracks on two sides of one body that are not seen together make two groups: these stand still against each other,
+    and the smaller one is left out.
     """
-    bodies = two_bodies(paths.uv, view.focal, seed)
-    if bodies is None:
+    asked = np.ones(len(paths), bool)
+    while (bodies := two_bodies(paths.uv, view.focal, seed, asked)) is not None:
+        fit = _between(*bodies, video, paths, view, full_focal)
+        if fit.verdict == "refused" or np.ptp(fit.q) > STROKE_STDS * np.median(fit.std["q"]):
+            return fit
+        asked &= ~min(bodies, key=lambda body: body.members.sum()).members
+    if asked.all():
         return None
-    static, link = bodies
+    return JointFit("refused", NO_STROKE, tracks=len(paths))
+
+
+def _between(static: Rigid, link: Rigid, video: Video, paths: Paths, view: View, full_focal: float) -> JointFit:
     starts = joints_between(static, link)
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])

@@ -53,17 +53,19 @@ class Rigid:
     cost: np.ndarray
 
 
-def two_bodies(uv: np.ndarray, focal: float, seed: int = 0) -> tuple[Rigid, Rigid] | None:
+def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | None = None
+               ) -> tuple[Rigid, Rigid] | None:  # fmt: skip
     """The two largest rigid groups, every track with the one that it fits better; None if there are none.
 
     Args:
         uv: (N, T, 2) px from the principal point, NaN where not seen.  focal: px.
+        asked: (N,) bool, tracks that may be in them; all when None.
     """
-    everything = np.ones(len(uv), bool)
-    one = rigid_group(uv, focal, everything, seed)
+    asked = np.ones(len(uv), bool) if asked is None else asked
+    one = rigid_group(uv, focal, asked, seed)
     if one is None:
         return None
-    other = rigid_group(uv, focal, ~one.members, seed)
+    other = rigid_group(uv, focal, asked & ~one.members, seed)
     if other is None:
         return None
     for _ in range(2):
