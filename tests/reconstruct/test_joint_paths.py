@@ -184,6 +184,22 @@ def test_a_joint_that_shadows_alone_follow_is_none(monkeypatch):
         assert fit.reason.startswith("what moves is a shadow: 30 of the 35") == (verdict == "refused")
 
 
+def test_where_shadows_outnumber_the_part_and_pass_for_a_joint_the_rest_is_asked(monkeypatch):
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    moving = moving_tracks(scene.video, scene.tracks)
+    shade = np.zeros(len(scene.tracks.uv), bool)
+    shade[moving[45:]] = True
+    nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
+
+    def follows(video, tracks, *args, **kwargs):
+        left = moving[tracks.visible[moving].any(1)]
+        return JointFit("ok", "made", "prismatic", point_track=left[-40:])
+
+    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", follows)
+    fit = joint_off_the_arm(scene.video, replace(scene.tracks, shade=shade), nobody, None, 0, lambda _: None)
+    assert fit.verdict == "ok" and not shade[fit.point_track].any()
+
+
 def test_shadows_edges_are_left_out_where_enough_else_moves(monkeypatch):
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     moving = moving_tracks(scene.video, scene.tracks)
