@@ -78,6 +78,7 @@ class Tracks:
             1 - s, where s is the noise across over the noise along: 0 at corners, near 1 on edges, where a point
             slides. None where nothing is known of it.
         shade: (N,) bool, on an edge whose two sides differ in brightness alone, as a shadow's do. None as before.
+        cast: (N,) bool, these of which what lies beneath is also seen to rest, as under a shadow. None as before.
     """
 
     uv: np.ndarray
@@ -86,6 +87,7 @@ class Tracks:
     provider: ProviderInfo
     slip: np.ndarray | None = None
     shade: np.ndarray | None = None
+    cast: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -236,8 +236,8 @@ def booleans(array: np.ndarray, shape: tuple[int | None, ...], what: str) -> np.
 
 
 def tracks_from_cue(cue: Arrays, frames: int, maker: ProviderInfo = GIVEN) -> Tracks:
-    """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T), optional slip (N, T, 2) and shade (N,) as in
-    :class:`Tracks`); seeded where first visible."""
+    """Tracks of ``tracks.npz`` (uv (N, T, 2) full px, visible (N, T), optional slip (N, T, 2), shade (N,) and
+    cast (N,) as in :class:`Tracks`); seeded where first visible."""
     uv = numbers(cue["uv"], (None, frames, 2), "uv of cues/tracks.npz")
     if not len(uv):
         raise TaaError("cues/tracks.npz holds no track; remove it and the pipeline tracks points itself")
@@ -249,8 +249,8 @@ def tracks_from_cue(cue: Arrays, frames: int, maker: ProviderInfo = GIVEN) -> Tr
         slip = np.nan_to_num(numbers(cue["slip"], uv.shape, "slip of cues/tracks.npz")).astype(np.float32)
         if (np.linalg.norm(slip, axis=-1) > 1 + 1e-3).any():
             raise TaaError("slip of cues/tracks.npz is longer than 1; its square is the share that is not held")
-    shade = booleans(cue["shade"], uv.shape[:1], "shade of cues/tracks.npz") if "shade" in cue else None
-    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), maker, slip, shade)
+    flags = [booleans(cue[k], uv.shape[:1], f"{k} of cues/tracks.npz") if k in cue else None for k in ("shade", "cast")]
+    return Tracks(uv.astype(np.float32), visible, visible.argmax(1), maker, slip, *flags)
 
 
 def hands_from_cue(cue: Arrays, camera: Arrays | None, video: Video, mask: np.ndarray | None,
@@ -541,5 +541,5 @@ def mask_arrays(masks: LinkMasks) -> dict[str, np.ndarray]:
 
 def track_arrays(tracks: Tracks) -> dict[str, np.ndarray]:
     """``tracks.npz``."""
-    more = {"slip": tracks.slip, "shade": tracks.shade}
+    more = {"slip": tracks.slip, "shade": tracks.shade, "cast": tracks.cast}
     return {"uv": tracks.uv, "visible": tracks.visible, **{k: v for k, v in more.items() if v is not None}}

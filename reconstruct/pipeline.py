@@ -309,8 +309,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     Sleeves often have more tracks than the part, and go nearly as it goes. Where nothing is found without them and
     they were many, the wedge of an arm may have held the part: then all tracks are asked, and a joint that is not
     mostly an arm's counts. Shadows go nearly as the part goes too. What may be the edge of one is left out where enough
-    else moves, and asked where nothing is found without it. Where too little else moves it is asked first, and left out
-    if nothing is found with it.
+    else moves, and asked where nothing is found without it.
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.fit import fit_joint, moving_tracks
@@ -323,9 +322,6 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     if fit.verdict == "refused" and lit is not rest:
         fit = fit_joint(video, rest, focal, seed, progress, camera_moving=False)
     fit = _unless_a_shadow(fit, tracks)
-    if fit.verdict == "refused" and lit is rest and (few := _off_shadows(video, rest, 0.0)) is not rest:
-        again = fit_joint(video, few, focal, seed, progress, camera_moving=False)
-        fit = again if again.verdict != "refused" else fit
     if fit.verdict == "refused" and share >= ARM_SHARE:
         again = _unless_a_shadow(fit_joint(video, tracks, focal, seed, progress, camera_moving=False), tracks)
         return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again
@@ -336,25 +332,24 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
 def _unless_a_shadow(fit: JointFit, tracks: Tracks) -> JointFit:
     """The joint, or a refusal where nearly all that follows it is the edge of a shadow: one that a waving hand casts
     slides over a table as exactly as a drawer."""
-    if fit.verdict == "refused" or tracks.shade is None:
+    if fit.verdict == "refused" or tracks.cast is None:
         return fit
-    cast = int(tracks.shade[fit.point_track].sum())
+    cast = int(tracks.cast[fit.point_track].sum())
     if cast < SHADOWS * len(fit.point_track):
         return fit
     reason = f"what moves is a shadow: {cast} of the {len(fit.point_track)} tracks that agree lie on the edge of one"
     return JointFit("refused", reason, tracks=fit.tracks, inliers=fit.inliers)
 
 
-def _off_shadows(video: Video, tracks: Tracks, share: float = LIT_SHARE) -> Tracks:
-    """The tracks without what may be the edge of a shadow, or the same where less than LIT_TRACKS, or than that share,
-    of what moves would be left."""
+def _off_shadows(video: Video, tracks: Tracks) -> Tracks:
+    """The tracks without what may be the edge of a shadow, or the same where too little that moves would be left."""
     from reconstruct.joint.fit import moving_tracks
 
     if tracks.shade is None:
         return tracks
     moving = moving_tracks(video, tracks)
     left = int((~tracks.shade[moving]).sum())
-    if left == len(moving) or left < max(LIT_TRACKS, share * len(moving)):
+    if left == len(moving) or left < max(LIT_TRACKS, LIT_SHARE * len(moving)):
         return tracks
     return replace(tracks, visible=tracks.visible & ~tracks.shade[:, None])
 

@@ -39,7 +39,7 @@ def joint_beside(video: Video, tracks: Tracks, fit: JointFit, other: OtherPart, 
 
     rows = np.asarray(other.tracks, int)
     some = replace(tracks, uv=tracks.uv[rows], visible=tracks.visible[rows], reference=tracks.reference[rows],
-                   slip=None if tracks.slip is None else tracks.slip[rows], shade=None)  # fmt: skip
+                   slip=None if tracks.slip is None else tracks.slip[rows], shade=None, cast=None)  # fmt: skip
     made = fit_joint(video, some, float(fit.K[0, 0]), seed, camera_moving=False)
     if made.verdict == "refused":
         return made

@@ -29,7 +29,7 @@ class Given:
         link: (N,) bool, said by the masks to lie on the moving link; None in row 3.
         wrong: (N, T) bool, truth: not an observation of its point.
         sigma_px, sigma_depth (of the logarithm), sigma_field: standard deviations of the noise; zeros in row 1.
-        hands: detected ones, slip, shade: of the tracks, as in :class:`Tracks`; row 4 only.
+        hands: detected ones, slip, shade, cast: of the tracks, as in :class:`Tracks`; row 4 only.
     """
 
     scene: Scene
@@ -45,6 +45,7 @@ class Given:
     hands: Hands | None = None
     slip: np.ndarray | None = None
     shade: np.ndarray | None = None
+    cast: np.ndarray | None = None
 
 
 def field_basis(uv: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo, Tracks
 from reconstruct.providers.affine import SPREAD, register
-from reconstruct.providers.shade import shadow_edges
+from reconstruct.providers.shade import BY_THEN, one_colour, rest_beneath
 from reconstruct.video import Video
 
 WINDOW = 15
@@ -161,16 +161,17 @@ def track_points(
             progress(done / 2)
     return Tracks(video.to_full(uv).astype(np.float32), np.isfinite(uv[..., 0]), reference,
                   ProviderInfo("lk", cv2.__version__, "Apache-2.0"), slip_of(grey, uv),
-                  _shadows(video, uv, covered))  # fmt: skip
+                  *_shadows(video, uv, covered))  # fmt: skip
 
 
-def _shadows(video: Video, uv: np.ndarray, covered: np.ndarray | None) -> np.ndarray:
-    """(N,) bool as in :class:`Tracks`; asked of what moves only."""
-    out = np.zeros(len(uv), bool)
+def _shadows(video: Video, uv: np.ndarray, covered: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool each, ``shade`` and ``cast`` as in :class:`Tracks`; the second is asked of what moves only."""
+    shade = one_colour(video.frames, uv)
+    cast = np.zeros(len(uv), bool)
     extent = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)
-    moves = np.flatnonzero(extent > SHADOW_PX)
-    out[moves] = shadow_edges(video.frames, uv[moves], covered)
-    return out
+    moves = np.flatnonzero(shade & (extent > SHADOW_PX))
+    cast[moves] = rest_beneath(video.frames, uv[moves], covered) >= BY_THEN
+    return shade, cast
 
 
 def slip_of(grey: np.ndarray, uv: np.ndarray) -> np.ndarray:

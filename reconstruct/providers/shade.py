@@ -30,23 +30,15 @@ BY_THEN = 0.5
 """Share of the frames of a track that some other time has to explain so."""
 
 
-def shadow_edges(frames: np.ndarray, uv: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray:
-    """Which points lie on the edge of a shadow.
+def one_colour(frames: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Points on an edge whose sides differ in brightness only, by the median over the frames that see them.
 
     Args:
         frames: (T, h, w, 3) uint8.  uv: (N, T, 2) px of these, NaN where not seen.
-        hidden: (T, h, w) bool, under a hand.
 
     Returns:
         (N,) bool.
     """
-    out = one_colour(frames, uv)
-    out[out] = rest_beneath(frames, uv[out], hidden) >= BY_THEN
-    return out
-
-
-def one_colour(frames: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(N,) bool: points on an edge whose sides differ in brightness only, by the median over the frames that see it."""
     N, T = uv.shape[:2]
     some = np.unique(np.linspace(0, T - 1, min(T, LOOKS)).round().astype(int))
     contrast, colour = np.full((2, N, len(some)), np.nan)
@@ -67,9 +59,14 @@ def one_colour(frames: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def rest_beneath(frames: np.ndarray, uv: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray:
-    """(N,) share of a track's frames in which the picture about it is another time's, one side of an edge darkened.
+    """Share of a track's frames in which the picture about it is another time's, one side of an edge darkened.
 
-    Args as in :func:`shadow_edges`.
+    Args:
+        frames: (T, h, w, 3) uint8.  uv: (N, T, 2) px of these, NaN where not seen.
+        hidden: (T, h, w) bool, under a hand.
+
+    Returns:
+        (N,) in [0, 1].
     """
     N, T = uv.shape[:2]
     times = np.unique(np.linspace(0, T - 1, min(T, TIMES)).round().astype(int))

@@ -17,7 +17,7 @@ from reconstruct.joint.polish import Reach, normal_equations, place_points, poli
 from reconstruct.joint.result import stay
 from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
-from reconstruct.providers.shade import one_colour, rest_beneath, shadow_edges
+from reconstruct.providers.shade import one_colour, rest_beneath
 from tests.reconstruct.joint_scenes import make_scene
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
@@ -163,12 +163,11 @@ def passing(dark, count=7):
 
 def test_under_a_shadow_the_grain_stays_and_under_a_part_of_that_colour_it_does_not():
     frames, edge = passing(lambda wall: 0.55 * wall)
-    assert one_colour(frames, edge).all() and rest_beneath(frames, edge) > 0.9 and shadow_edges(frames, edge).all()
+    assert one_colour(frames, edge).all() and rest_beneath(frames, edge) > 0.9
     # Under a hand at all other times nothing is known of the place.
     assert rest_beneath(frames, edge, np.ones(frames.shape[:3], bool)) == 0
     frames, edge = passing(lambda wall: np.zeros_like(wall) + 0.35 * np.array([110.0, 105.0, 95.0]))
     assert one_colour(frames, edge).all() and rest_beneath(frames, edge) < 0.2
-    assert not shadow_edges(frames, edge).any()
 
 
 def test_a_joint_that_shadows_alone_follow_is_none(monkeypatch):
@@ -179,25 +178,9 @@ def test_a_joint_that_shadows_alone_follow_is_none(monkeypatch):
     for ids, verdict in ((np.arange(35), "refused"), (np.arange(45), "ok")):
         monkeypatch.setattr("reconstruct.joint.fit.fit_joint",
                             lambda *_, ids=ids, **__: JointFit("ok", "made", "prismatic", point_track=ids))  # fmt: skip
-        fit = joint_off_the_arm(scene.video, replace(scene.tracks, shade=shade), nobody, None, 0, lambda _: None)
+        fit = joint_off_the_arm(scene.video, replace(scene.tracks, cast=shade), nobody, None, 0, lambda _: None)
         assert fit.verdict == verdict
         assert fit.reason.startswith("what moves is a shadow: 30 of the 35") == (verdict == "refused")
-
-
-def test_where_shadows_outnumber_the_part_and_pass_for_a_joint_the_rest_is_asked(monkeypatch):
-    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
-    moving = moving_tracks(scene.video, scene.tracks)
-    shade = np.zeros(len(scene.tracks.uv), bool)
-    shade[moving[45:]] = True
-    nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
-
-    def follows(video, tracks, *args, **kwargs):
-        left = moving[tracks.visible[moving].any(1)]
-        return JointFit("ok", "made", "prismatic", point_track=left[-40:])
-
-    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", follows)
-    fit = joint_off_the_arm(scene.video, replace(scene.tracks, shade=shade), nobody, None, 0, lambda _: None)
-    assert fit.verdict == "ok" and not shade[fit.point_track].any()
 
 
 def test_shadows_edges_are_left_out_where_enough_else_moves(monkeypatch):
