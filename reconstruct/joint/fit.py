@@ -245,7 +245,9 @@ class _Consensus:
 
 def _paths(video: Video, tracks: Tracks) -> Paths:
     """The tracks in working px."""
-    return Paths(video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan)), tracks.slip)
+    # What the compensation of a hand-held camera leaves is along edges as much as across.
+    slip = None if video.warp is not None else tracks.slip
+    return Paths(video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan)), slip)
 
 
 def _moving(paths: Paths, diagonal: float) -> np.ndarray:
