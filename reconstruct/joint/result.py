@@ -10,6 +10,7 @@ from reconstruct.joint.evidence import bridged, looser
 from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, turn_deg
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.polish import Bundle, Sightings, positions, residuals
+from reconstruct.joint.uncertainty import compact
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 
@@ -134,13 +135,16 @@ def result_of(
 
 
 def stay(b: Bundle, s: Sightings) -> np.ndarray:
-    """(N,) bool: points whose tracks stayed on them; all of them where hardly any did. What slides along an edge has a
-    say in the joint, but is in no one place of the link."""
+    """(N,) bool: points near the others whose tracks stayed on them; all that are near the others where hardly any did.
+
+    What slides along an edge has a say in the joint, but is in no one place of the link; nor is a track that is
+    explained only far before or behind it.
+    """
+    near = compact(b.X) & (b.X[:, 2] > 0)
     off = np.linalg.norm(residuals(b, replace(s, slip=None)), axis=-1)
-    out = np.zeros(len(off), bool)
-    some = s.seen.any(1)
-    out[some] = np.nanmedian(np.where(s.seen, off, np.nan)[some], axis=1) < SLID_PX
-    return out if out.sum() >= MIN_INLIERS else np.ones(len(off), bool)
+    out = near & s.seen.any(1)
+    out[out] = np.nanmedian(np.where(s.seen, off, np.nan)[out], axis=1) < SLID_PX
+    return out if out.sum() >= MIN_INLIERS else near
 
 
 def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:

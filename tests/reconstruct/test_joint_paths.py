@@ -211,3 +211,11 @@ def test_a_point_that_slid_off_is_not_handed_on():
     assert stay(truth, some)[:25].all() and stay(truth, some)[25:].mean() < 0.5
     far = replace(s, uv=s.uv + 50.0)
     assert stay(truth, far).all()
+
+
+def test_a_point_far_before_or_behind_the_link_is_not_handed_on():
+    truth, s = scene("revolute", points=40, noise=0.1)
+    X = truth.X.copy()
+    X[:3] *= [[30.0], [1e4], [-1.0]]
+    kept = stay(replace(truth, X=X), s)
+    assert not kept[:3].any() and kept[3:].all()
