@@ -51,6 +51,7 @@ STROKE_STDS = 8.0
 NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
 NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
+ALONE = "all that is followed moves as one body: the camera may go round it as well as the part may turn"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
 PRIOR_STD = 0.12
@@ -100,7 +101,8 @@ def fit_joint(
     camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
     view = View(camera.focal, 0.0 if known else PRIOR_STD)
-    if camera_moving or (camera_moving is None and camera_moves(paths.uv, camera.diagonal)):
+    alone = camera_moving is None and camera_moves(paths.uv, camera.diagonal)
+    if camera_moving or alone:
         fit = _moving_camera(video, paths - camera.centre, view, full, seed)
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
@@ -119,6 +121,8 @@ def fit_joint(
     if answer.verdict == "refused" and answer.inliers < MIN_INLIERS and video.warp is None:
         answer = _slight(video, paths - camera.centre, camera, view, known) or answer
     tell(1.0)
+    if alone and answer.verdict == "ok":
+        return replace(answer, verdict="ambiguous", reason=f"{ALONE}; {answer.reason}")
     return answer
 
 

@@ -93,6 +93,14 @@ def filmed(uv):
                          ProviderInfo("t", "1", "-"))  # fmt: skip
 
 
+def test_a_body_that_is_all_there_is_may_be_a_scene_before_a_camera_that_goes_round():
+    tracks = scene()[0][120:]
+    for moving, verdict in ((None, "ambiguous"), (False, "ok")):
+        fit = fit_joint(*filmed(tracks), FOCAL, camera_moving=moving)
+        assert (fit.verdict, fit.type) == (verdict, "revolute")
+        assert fit.reason.startswith("all that is followed moves as one body") == (moving is None)
+
+
 @pytest.mark.slow
 def test_two_sides_of_one_body_are_no_joint():
     """A knob that turns by 80 deg before an orbiting camera: its tracks make two groups larger than the scene's."""
