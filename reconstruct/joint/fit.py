@@ -88,6 +88,7 @@ def fit_joint(
         progress: called with the done share.
         camera_moving: whether the camera moves; judged from how many tracks keep their place when None. A moving one
             is found together with the joint, from the static scene's tracks; the world is then up to the first camera.
+            Where it is not said and all tracks move as one body, the answer is "ambiguous".
 
     Returns:
         A JointFit up to scale (median depth of the link = 1), or one with verdict "refused".
@@ -101,8 +102,8 @@ def fit_joint(
     camera = _Camera(full * video.scale, np.array([(w - 1) / 2, (h - 1) / 2]), float(np.hypot(h, w)))
 
     view = View(camera.focal, 0.0 if known else PRIOR_STD)
-    alone = camera_moving is None and camera_moves(paths.uv, camera.diagonal)
-    if camera_moving or alone:
+    all_moves = camera_moving is None and camera_moves(paths.uv, camera.diagonal)
+    if camera_moving or all_moves:
         fit = _moving_camera(video, paths - camera.centre, view, full, seed)
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
@@ -121,7 +122,7 @@ def fit_joint(
     if answer.verdict == "refused" and answer.inliers < MIN_INLIERS and video.warp is None:
         answer = _slight(video, paths - camera.centre, camera, view, known) or answer
     tell(1.0)
-    if alone and answer.verdict == "ok":
+    if all_moves and answer.verdict == "ok":
         return replace(answer, verdict="ambiguous", reason=f"{ALONE}; {answer.reason}")
     return answer
 

@@ -135,7 +135,8 @@ def result_of(
 
 
 def stay(b: Bundle, s: Sightings) -> np.ndarray:
-    """(N,) bool: points near the others whose tracks stayed on them; all that are near the others where hardly any did.
+    """(N,) bool: points near the others whose tracks stayed on them; where these are hardly any all near the others, or
+    at last all.
 
     What slides along an edge has a say in the joint, but is in no one place of the link; nor is a track that is
     explained only far before or behind it.
@@ -144,7 +145,10 @@ def stay(b: Bundle, s: Sightings) -> np.ndarray:
     off = np.linalg.norm(residuals(b, replace(s, slip=None)), axis=-1)
     out = near & s.seen.any(1)
     out[out] = np.nanmedian(np.where(s.seen, off, np.nan)[out], axis=1) < SLID_PX
-    return out if out.sum() >= MIN_INLIERS else near
+    for kept in (out, near):
+        if kept.sum() >= MIN_INLIERS:
+            return kept
+    return np.ones(len(near), bool)
 
 
 def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:
