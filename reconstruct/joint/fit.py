@@ -33,6 +33,8 @@ from reconstruct.joint.select import (
     motion_stretches,
     observations,
     search,
+    sharpened,
+    worth,
 )
 from reconstruct.joint.slight import slight_motion
 from reconstruct.joint.sweep import SMALL, sweep
@@ -300,13 +302,15 @@ def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Ca
     if not best:
         return _Consensus(refusal="no tracks move together for long enough to draw a joint", scattered=True)
     # The hinge contains the slide: it has to explain clearly more to name the tracks of the link.
-    worth = {kind: explained(s, obs)[0] * (SIMPLER if kind == "prismatic" else 1.0) for kind, s in best.items()}
+    value = {kind: worth(s, obs) * (SIMPLER if kind == "prismatic" else 1.0) for kind, s in best.items()}
     # All moving tracks, not just the sample of the search, for the consensus set.
     every, ids = observations(paths[moving], focal, centre, keys, 900, rng, diagonal)
     first: _Consensus | None = None
-    for kind in sorted(best, key=lambda kind: -worth[kind]):
+    for kind in sorted(best, key=lambda kind: -value[kind]):
         # There is no joint only if every type is refuted.
-        s = refine(_redepth(best[kind], every), every, scales=(3.0, 2.0), iterations=8)
+        s = _redepth(best[kind], every)
+        s = max((sharpened(r, every) for r in (s, refine(s, every, scales=(3.0, 2.0), iterations=8))),
+                key=lambda r: worth(r, every))  # fmt: skip
         total, share = explained(s, every)
         follows = share > 0.5
         link = every.of(follows)
@@ -314,7 +318,7 @@ def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Ca
         starts |= {k: [(_redepth(b, link), link)] for k, b in best.items() if k != kind}
         # Hinges that lean to either side of the viewing ray may explain nearly the same: the last digits tell.
         if "revolute" in best:
-            near = [h for h in ranked if h.kind == "revolute" and explained(h, obs)[0] > RIVAL * worth["revolute"]]
+            near = [h for h in ranked if h.kind == "revolute" and worth(h, obs) > RIVAL * value["revolute"]]
             starts["revolute"] += [(_redepth(h, link), link) for h in distinct(near, RIVALS)[1:]]
         found = _Consensus(starts, moving[ids[follows]], total, _why_refused(s, every, follows) or "",
                            bool(follows.sum() < MIN_INLIERS), obs, moving)  # fmt: skip

@@ -7,12 +7,12 @@ import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint import fit as fit_module
-from reconstruct.joint.bundle import State, refine, solve_depths
+from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.paths import Paths
-from reconstruct.joint.select import _tilted_back, key_frames, observations
+from reconstruct.joint.select import _tilted_back, explained, key_frames, observations, worth
 from tests.reconstruct.joint_scenes import H, W, make_scene, make_video, project
 
 SLAB = [[-0.3, 0.3], [-0.4, 0.0], [-0.02, 0.02]]
@@ -188,3 +188,20 @@ def test_exact_tracks_tell_a_hinge_from_a_body_that_is_carried_nearly_so(aside):
         assert fit.verdict == "refused" and "free body" in fit.reason
     else:
         assert fit.verdict == "ok" and axis_error_deg(fit, scene) < 0.3
+
+
+def test_one_body_met_exactly_is_worth_more_than_two_met_half():
+    # Twenty points go 40 px to the right, twenty others 40 px nearly so: 3 px apart in the end.
+    px, K, rng = 1 / 768, 10, np.random.default_rng(0)
+    turn = np.repeat([0.0, 3 / 40], 20)
+    way = np.stack([np.cos(turn), np.sin(turn)], axis=-1)[:, None] * np.linspace(0, 40 * px, K)[:, None]
+    xy = rng.uniform(-0.3, 0.3, (40, 1, 2)) + way
+    obs = Observations(xy, np.ones((40, K), bool), np.zeros(40, int), np.ones(40), px, np.arange(K))
+
+    def slide(angle):
+        axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+        return solve_depths(State("prismatic", axis, np.zeros(3), np.linspace(0, 40 * px, K), np.ones(40)), obs)
+
+    exact, between = slide(0.0), slide(turn.max() / 2)
+    assert explained(between, obs)[0] > explained(exact, obs)[0]
+    assert worth(exact, obs) > 1.1 * worth(between, obs)
