@@ -170,17 +170,45 @@ def test_under_a_shadow_the_grain_stays_and_under_a_part_of_that_colour_it_does_
     assert one_colour(frames, edge).all() and rest_beneath(frames, edge) < 0.2
 
 
-def test_a_joint_that_shadows_alone_follow_is_none(monkeypatch):
+@pytest.mark.parametrize(("agree", "found", "verdict", "words"), [
+    (35, False, "refused", "what moves is a shadow: 30 of the 35"),
+    (60, False, "ambiguous", "part of what moves is a shadow: 30 of the 60"),
+    (60, True, "ok", "without what is on a shadow's edge, made"),
+    (80, True, "ok", "made"),
+])  # fmt: skip
+def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agree, found, verdict, words):
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
-    shade = np.zeros(len(scene.tracks.uv), bool)
-    shade[:30] = True
+    cast = np.arange(len(scene.tracks.uv)) < 30
+
+    def answer(video, tracks, *_, **__):
+        if tracks.visible[cast].any() or found:
+            return JointFit("ok", "made", "prismatic", point_track=np.flatnonzero(tracks.visible.any(1))[:agree])
+        return JointFit("refused", "nothing moves")
+
+    monkeypatch.setattr("reconstruct.joint.fit.fit_joint", answer)
     nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
-    for ids, verdict in ((np.arange(35), "refused"), (np.arange(45), "ok")):
-        monkeypatch.setattr("reconstruct.joint.fit.fit_joint",
-                            lambda *_, ids=ids, **__: JointFit("ok", "made", "prismatic", point_track=ids))  # fmt: skip
-        fit = joint_off_the_arm(scene.video, replace(scene.tracks, cast=shade), nobody, None, 0, lambda _: None)
-        assert fit.verdict == verdict
-        assert fit.reason.startswith("what moves is a shadow: 30 of the 35") == (verdict == "refused")
+    fit = joint_off_the_arm(scene.video, replace(scene.tracks, cast=cast), nobody, None, 0, lambda _: None)
+    assert fit.verdict == verdict
+    assert fit.reason.startswith(words)
+
+
+def test_a_hinge_whose_shadow_goes_along_is_found_without_it():
+    hinge = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8,
+                       noise=0.15, impostors=0)  # fmt: skip
+    # A flat shadow on the table below, as wide as the door, that slides as the door opens.
+    slide = make_scene("prismatic", [1, 0, -0.4], [0.1, 0.35, 1.5], [[-0.3, 0.3], [0, 0], [-0.2, 0.2]], 0.3, points=140,
+                       noise=0.15, impostors=0, seed=1)  # fmt: skip
+    shadow = slice(0, 140)
+    both = replace(hinge.tracks, uv=np.concatenate([slide.tracks.uv[shadow], hinge.tracks.uv]),
+                   visible=np.concatenate([slide.tracks.visible[shadow], hinge.tracks.visible]),
+                   reference=np.concatenate([slide.tracks.reference[shadow], hinge.tracks.reference]),
+                   cast=np.arange(140 + len(hinge.tracks.uv)) < 140)  # fmt: skip
+    nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
+    fit = joint_off_the_arm(hinge.video, both, nobody, 768.0, 0, lambda _: None)
+    assert fit.verdict == "ok" and fit.type == "revolute", fit.reason
+    assert fit.reason.startswith("without what is on a shadow's edge")
+    assert (fit.point_track >= 140).all()
+    assert np.degrees(np.arccos(abs(fit.T_camera_world[:3, :3] @ fit.axis @ hinge.axis))) < 1.0
 
 
 def test_shadows_edges_are_left_out_where_enough_else_moves(monkeypatch):
