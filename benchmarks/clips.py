@@ -20,6 +20,7 @@ import numpy as np
 
 REAL = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "videos"
 RENDERED = ("demo", "demo_handheld", "drawer", "laptop", "oven", "locker", "puncher", "lift", "still")
+"""Those of :func:`reconstruct.synth.list_clips` that run when no clip is named."""
 
 
 def annotations() -> dict[str, dict]:
@@ -87,12 +88,11 @@ def run(name: str, folder: Path) -> dict:
     """
     from reconstruct.errors import TaaError
     from reconstruct.pipeline import reconstruct
+    from reconstruct.synth import list_clips, load_truth, render_clip
 
-    rendered = name in RENDERED
+    rendered = name in list_clips()
     truth = None
     if rendered:
-        from reconstruct.synth import load_truth, render_clip
-
         clip = render_clip(name, folder / "clips")
         truth = load_truth(clip)
         video, kind = truth.video, truth.type
@@ -143,10 +143,15 @@ def main() -> None:
     """Print the table; rows go to stderr as they come."""
     import sys
 
+    from reconstruct.synth import list_clips
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", help="clips to run")
     parser.add_argument("--keep", type=Path, help="folder for clips and assets (default: a temporary one)")
     args = parser.parse_args()
+    known = [*list_clips(), *annotations()]
+    if unknown := [name for name in args.only or () if name not in known]:
+        parser.error(f"no clip {unknown[0]!r}; there are {', '.join(known)}")
     rows = []
     with tempfile.TemporaryDirectory(prefix="taa-clips-") as scratch:
         for name in args.only or [*RENDERED, *annotations()]:

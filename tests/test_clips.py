@@ -74,3 +74,12 @@ def test_joints_that_need_exact_tracks_and_a_wide_search(name, tmp_path):
     assert np.ptp(joint["q"]) == pytest.approx(np.ptp(truth.q), rel=0.06)
     if name == "puncher":
         assert made.replay["joint_progress"] > 0.9 and max(made.replay["controls"].values()) < 0.05
+
+
+def test_a_clip_that_is_none_is_named_in_one_line(monkeypatch, capsys):
+    from benchmarks.clips import main
+
+    monkeypatch.setattr("sys.argv", ["clips", "--only", "demo", "nothere"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "no clip 'nothere'; there are demo, " in capsys.readouterr().err
