@@ -77,3 +77,11 @@ def test_the_citation_is_complete() -> None:
     text = (ROOT / "CITATION.cff").read_text()
     version = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(), re.M)[1]
     assert f"version: {version}\n" in text and all(k in text for k in ("cff-version", "title", "authors", "license"))
+
+
+def test_the_clips_stand_in_the_readme_as_on_their_page() -> None:
+    def rows(page: Path) -> list[str]:
+        return re.findall(r"^\| [a-z_0-9.]+ \| (?:revolute|prismatic|none) \|.*$", page.read_text(), re.M)
+
+    own = rows(ROOT / "docs" / "benchmarks" / "clips.md")
+    assert len(own) > 20 and own == rows(ROOT / "README.md")
