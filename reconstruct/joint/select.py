@@ -243,7 +243,8 @@ def patch_states(obs: Observations, rng: np.random.Generator) -> list[State]:
 
 
 def _refined(s: State, obs: Observations) -> State:
-    """The better of a wide and a narrow refinement: a wide one reaches further, but an arm's many tracks pull at it."""
+    """The better of a wide and a narrow refinement, sharpened: a wide one reaches further, but an arm's many tracks pull
+    at it."""
     both = [refine(s, obs, scales=scales, iterations=6) for scales in ((10.0, 5.0), (4.0, 2.0))]
     return sharpened(max(both, key=lambda r: explained(r, obs)[0]), obs)
 
@@ -359,6 +360,7 @@ def worth(s: State, obs: Observations) -> float:
 
 
 def _explained_at(s: State, obs: Observations, scales: Sequence[float]) -> list[tuple[float, np.ndarray]]:
+    """:func:`explained` at each of these scales, working px."""
     r2 = np.sum(reprojection(transport(s, obs)[0], obs) ** 2, axis=-1)
     sane = (s.depth > 0.1 * np.median(s.depth)) & (s.depth < 10 * np.median(s.depth))
     out = []

@@ -198,7 +198,7 @@ def test_a_hinge_whose_shadow_goes_along_is_found_without_it():
     # A flat shadow on the table below, as wide as the door, that slides as the door opens.
     slide = make_scene("prismatic", [1, 0, -0.4], [0.1, 0.35, 1.5], [[-0.3, 0.3], [0, 0], [-0.2, 0.2]], 0.3, points=140,
                        noise=0.15, impostors=0, seed=1)  # fmt: skip
-    shadow = slice(0, 140)
+    shadow = slice(0, 140)  # its points come first, then what rests
     both = replace(hinge.tracks, uv=np.concatenate([slide.tracks.uv[shadow], hinge.tracks.uv]),
                    visible=np.concatenate([slide.tracks.visible[shadow], hinge.tracks.visible]),
                    reference=np.concatenate([slide.tracks.reference[shadow], hinge.tracks.reference]),
