@@ -243,8 +243,10 @@ def patch_states(obs: Observations, rng: np.random.Generator) -> list[State]:
 
 
 def _refined(s: State, obs: Observations) -> State:
-    """The better of a wide and a narrow refinement, sharpened: a wide one reaches further, but an arm's many tracks pull
-    at it."""
+    """The better of a wide and a narrow refinement, sharpened.
+
+    A wide one reaches further, but an arm's many tracks pull at it.
+    """
     both = [refine(s, obs, scales=scales, iterations=6) for scales in ((10.0, 5.0), (4.0, 2.0))]
     return sharpened(max(both, key=lambda r: explained(r, obs)[0]), obs)
 
