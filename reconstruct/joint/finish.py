@@ -11,6 +11,7 @@ from scipy.special import expit
 
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.cameras import before_the_link, rougher
+from reconstruct.joint.halves import halves, widened
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities, tempered, votes
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import (
@@ -256,8 +257,8 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         every = [hinge, polish(hinge, few, hold=HELD), *(_refitted(b, hinge, few) for b in others.get("revolute", []))]
         near = [b for b in every if radius_cost(b, few) < NEAR * b.sigma**2 * few.lasting and turn_deg(b) < 360]
     probability = type_probabilities(best, few, near)
-    last = best[_winner(probability)]
-    sure = spread(last, few)
+    last, several = halves(best[_winner(probability)], few)
+    sure = widened(spread(last, few), last, several)
     rival = _rival(last, others.get(last.kind, []), few) if still is None else None
     weight = few.weight
     if few.link is not None:
