@@ -37,7 +37,7 @@ def score(given: Given, answer: Answer, best: Bound | None) -> dict:
     }  # fmt: skip
     # Said with a verdict "ok" and a probability of 0.9 or more, and wrong.
     row["confidently_wrong"] = bool(
-        answer.axis is not None and not row["type_right"] and row["probability"] >= CONFIDENT
+        answer.verdict == "ok" and answer.axis is not None and not row["type_right"] and row["probability"] >= CONFIDENT
     )
     if answer.axis is None:
         row |= {"axis_deg": FAILED_DEG, "location_mm": 1e3 * FAILED_M if hinge else None,

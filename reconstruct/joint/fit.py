@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -69,7 +69,7 @@ TRIES = 3
 """Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
 nothing better than that."""
 LUCKIER = 1.1
-"""What a later draw has to explain more than those before it."""
+"""What a later draw, or another stretch of the video, has to explain more than those before it."""
 
 
 def fit_joint(
@@ -129,6 +129,18 @@ def fit_joint(
     return answer
 
 
+def _dominant(tries: Sequence[_Consensus]) -> _Consensus:
+    """Of the joints of several stretches, those with more motion first: a later one has to explain clearly more.
+
+    Two drawers of one chest explain the same to a hundredth, and the last digits would choose.
+    """
+    found = tries[0]
+    for other in tries[1:]:
+        if other.explained > LUCKIER * found.explained:
+            found = other
+    return found
+
+
 def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None) -> JointFit | None:
     """The joint of a motion of few pixels, or None if there is none to believe; px from the principal point."""
     if (found := slight_motion(paths, view)) is None:
@@ -161,7 +173,7 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
         ]
         tries = [t for t in tries if not t.refusal]
         if tries:
-            found = max(tries, key=lambda t: t.explained)
+            found = _dominant(tries)
             note = f"; no joint explains the whole video: the dominant of {len(stretches)} stretches of motion is taken"
     if found.refusal:
         return JointFit("refused", found.refusal, tracks=len(paths), inliers=len(found.members)), found.explained

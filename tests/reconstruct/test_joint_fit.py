@@ -205,3 +205,12 @@ def test_one_body_met_exactly_is_worth_more_than_two_met_half():
     exact, between = slide(0.0), slide(turn.max() / 2)
     assert explained(between, obs)[0] > explained(exact, obs)[0]
     assert worth(exact, obs) > 1.1 * worth(between, obs)
+
+
+def test_another_stretch_has_to_explain_clearly_more():
+    """Two drawers of one chest explain the same to a hundredth: the one that moves more, which comes first, counts."""
+    from reconstruct.joint.fit import _Consensus, _dominant
+
+    several = [_Consensus(explained=x) for x in (154.7, 157.4, 96.3)]
+    assert _dominant(several) is several[0]
+    assert _dominant([*several, clear := _Consensus(explained=190.0)]) is clear
