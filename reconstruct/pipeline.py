@@ -211,7 +211,7 @@ def reconstruct(video_path: str | Path, id: str, scene: str | Path | None = None
 
 def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: float | None, overwrite: bool, seed: int,
                  stages: Stages, scratch: Path) -> ReconstructResult:  # fmt: skip
-    from reconstruct.report import refusal_report
+    from taa_envs.errors import GateFailed
 
     video, seen = None, None
     try:
@@ -220,18 +220,33 @@ def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: fl
         if seen.fit.verdict == "refused":
             raise Refused(with_advice(seen.fit.reason))
     except Refused as refusal:
-        fit = seen.fit if seen is not None else None
-        joint = joint_object(fit, video.index) if fit is not None and video is not None else refused_joint(str(refusal))
-        notes = seen.notes if seen is not None else video.notes if video is not None else ()
-        if scene is not None:
-            scene.mkdir(parents=True, exist_ok=True)
-            page = refusal_report(
-                id, path, video, seen and seen.hands, seen and seen.tracks, fit, str(refusal), notes, stages.seconds
-            )
-            with written_whole(scene / "report.html") as partial:
-                partial.write_text(page, encoding="utf-8")
-        return ReconstructResult(id, None, joint, None, stages.seconds, notes, str(refusal))
-    return _build(id, scene, final, overwrite, seed, seen, stages)
+        return _refusal(path, id, scene, video, seen, str(refusal), stages)
+    try:
+        return _build(id, scene, final, overwrite, seed, seen, stages)
+    except GateFailed as failed:
+        if seen.fit.verdict == "ok":
+            raise
+        # A joint that was in doubt and makes a body that does not behave is none to build on.
+        fit = replace(seen.fit, verdict="refused", reason=f"{seen.fit.reason}; {failed}")
+        return _refusal(path, id, scene, video, replace(seen, fit=fit), fit.reason, stages)
+
+
+def _refusal(path: Path, id: str, scene: Path | None, video: Video | None, seen: Seen | None, reason: str,
+             stages: Stages) -> ReconstructResult:  # fmt: skip
+    """The result without an asset, and its page in the scene folder."""
+    from reconstruct.report import refusal_report
+
+    fit = seen.fit if seen is not None else None
+    joint = joint_object(fit, video.index) if fit is not None and video is not None else refused_joint(reason)
+    notes = seen.notes if seen is not None else video.notes if video is not None else ()
+    if scene is not None:
+        scene.mkdir(parents=True, exist_ok=True)
+        page = refusal_report(
+            id, path, video, seen and seen.hands, seen and seen.tracks, fit, reason, notes, stages.seconds
+        )
+        with written_whole(scene / "report.html") as partial:
+            partial.write_text(page, encoding="utf-8")
+    return ReconstructResult(id, None, joint, None, stages.seconds, notes, reason)
 
 
 def with_advice(reason: str) -> str:

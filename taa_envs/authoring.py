@@ -25,6 +25,7 @@ from taa_envs.asset import (
     load_asset,
 )
 from taa_envs.checks import numbered
+from taa_envs.errors import GateFailed
 from taa_envs.files import folder_written_whole
 from taa_envs.gate import examine
 from taa_envs.mechanism import DENSITY, FurtherLink, Moving, prepare, typical_speed
@@ -148,7 +149,7 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
 
     Raises:
         AssetExists: there is one and overwrite is False.
-        AssetError: an argument is not valid, or the body does not pass the gate; nothing was written.
+        AssetError: an argument is not valid, or the body does not pass the gate (GateFailed); nothing was written.
     """
     import mujoco
 
@@ -205,7 +206,7 @@ def save_asset(root: str | os.PathLike, asset_id: str, *, joint: Mapping, static
             if gate:
                 found = examine(made_asset)
                 if not found.passed:
-                    raise AssetError(f"{asset_id} does not pass the gate: {found.failures[0]}")
+                    raise GateFailed(f"{asset_id} does not pass the gate: {found.failures[0]}")
                 _write_json(folder / "asset.json", {**document, "gate": found.as_dict()})
     except FileExistsError:  # made by somebody else while we worked
         raise AssetExists(f"{final} exists; choose another id or overwrite it") from None

@@ -9,6 +9,10 @@ class AssetError(TaaEnvsError):
     """An asset folder, or what was to become one, is not valid."""
 
 
+class GateFailed(AssetError):
+    """The body is valid and does not behave: it falls through itself, does not come to rest, or weighs tons."""
+
+
 class AssetExists(AssetError):
     """There is an asset of that id already."""
 

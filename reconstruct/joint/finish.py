@@ -88,6 +88,8 @@ class Finished:
         spread: its uncertainty.  probability: of each type.
         view: focal length and camera, whose path is fitted together with the joint where it moves.
         rival: the most probable of the other axes that were among the starts.
+        once: the bundle as one adjustment found it, before halves of the link led to a better one; that where None. A
+            free body is fitted once as well, and is held against this.
     """
 
     bundle: Bundle
@@ -97,6 +99,7 @@ class Finished:
     probability: dict[str, float]
     view: View
     rival: Rival | None = None
+    once: Bundle | None = None
 
 
 @dataclass(frozen=True)
@@ -257,21 +260,29 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         every = [hinge, polish(hinge, few, hold=HELD), *(_refitted(b, hinge, few) for b in others.get("revolute", []))]
         near = [b for b in every if radius_cost(b, few) < NEAR * b.sigma**2 * few.lasting and turn_deg(b) < 360]
     probability = type_probabilities(best, few, near)
-    last, several = halves(best[_winner(probability)], few)
+    once = best[_winner(probability)]
+    last, several = halves(once, few)
     sure = widened(spread(last, few), last, several)
     rival = _rival(last, others.get(last.kind, []), few) if still is None else None
     weight = few.weight
     if few.link is not None:
         view = view.corrected(last, some)
         last, weight = replace(last, X=last.X[few.link], R=None, t=None), weight[few.link]
+        once = last
     sight = replace(sight, weight=np.interp(np.arange(len(members)), bound, weight), lasting=few.lasting)
     sight.seen[bound] = few.seen[: len(bound)]
-    b = place_points(replace(last, X=X), sight, rounds=4) if len(bound) < len(members) else last
     every = replace(view.sightings(paths[members], np.arange(T), few.lasting), weight=sight.weight)
+
+    def whole(b: Bundle) -> Bundle:
+        """With the points of all tracks, and states in all frames."""
+        if len(bound) < len(members):
+            b = place_points(replace(b, X=X), sight, rounds=4)
+        return states_of_all_frames(b, every, some) if len(some) < T else b
+
     if len(some) < T:
-        b = states_of_all_frames(b, every, some)
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
-    return Finished(b, every, members, sure, probability, view, rival)
+    first = None if once is last else whole(once)
+    return Finished(whole(last), every, members, sure, probability, view, rival, first)
 
 
 def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sightings:

@@ -33,26 +33,27 @@ def why_not_believed(done: Finished, restlessness: float = np.inf) -> str | None
     Args:
         restlessness: px, what points at rest leave their place by.
     """
-    turn = turn_deg(done.bundle)
-    if done.bundle.kind == "screw" and turn < SCREW_TURN_DEG:
+    bundle = done.once or done.bundle
+    turn = turn_deg(bundle)
+    if bundle.kind == "screw" and turn < SCREW_TURN_DEG:
         return (
             f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any "
             f"body does that is carried a short way (a screw is believed from {SCREW_TURN_DEG:.0f} deg on)"
         )
-    b = bridged(done.bundle, done.sight)
+    b = bridged(bundle, done.sight)
     if b.supported < BRIDGED_SHARE:
         return f"too few tracks last through the motion: {1 - b.supported:.0%} of the stroke is seen by hardly any"
     if b.error > BRIDGED_ERROR:
         return (
-            f"no joint: from one state to the next the best one ({done.bundle.kind}) misses {b.error:.0%} of the way "
+            f"no joint: from one state to the next the best one ({bundle.kind}) misses {b.error:.0%} of the way "
             "that its own points go"
         )
-    misses = done.bundle.sigma > RESTLESS * restlessness
-    times = looser(done.bundle, done.sight) if misses else None
+    misses = bundle.sigma > RESTLESS * restlessness
+    times = looser(bundle, done.sight) if misses else None
     if times is not None and times > LOOSER:
         return (
             f"the part moves as a free body: its points follow one {times:.2g} times more exactly than the best joint "
-            f"({done.bundle.kind})"
+            f"({bundle.kind})"
         )
     return None
 
