@@ -226,9 +226,11 @@ def _reconstruct(path: Path, id: str, scene: Path | None, final: Path, focal: fl
     except GateFailed as failed:
         if seen.fit.verdict == "ok":
             raise
-        # A joint that was in doubt and makes a body that does not behave is none to build on.
-        fit = replace(seen.fit, verdict="refused", reason=f"{seen.fit.reason}; {failed}")
-        return _refusal(path, id, scene, video, replace(seen, fit=fit), fit.reason, stages)
+        # A joint that was in doubt and makes a body that does not behave is none to build on. What the gate advises is
+        # for those who make a body.
+        reason = f"{seen.fit.reason}; {str(failed).split(';')[0]}"
+        fit = replace(seen.fit, verdict="refused", reason=reason)
+        return _refusal(path, id, scene, video, replace(seen, fit=fit), reason, stages)
 
 
 def _refusal(path: Path, id: str, scene: Path | None, video: Video | None, seen: Seen | None, reason: str,

@@ -12,6 +12,8 @@ from taa_envs.refine import refine
 
 pytestmark = pytest.mark.slow
 PRESENT = annotations()
+SLIPPERY = ("dishwasher.mp4",)
+"""Where the landmarks' last digits, which differ between machines, decide whether the grip slips (docs/limits.md)."""
 
 
 def real(name):
@@ -32,9 +34,10 @@ def test_real_clip_gives_the_annotated_joint_and_a_replay(name, tmp_path):
     if "range_deg" in truth:
         assert truth["range_deg"][0] <= row["range"] <= truth["range_deg"][1]
     assert max(row["replay"]["controls"].values()) < 0.1
-    if row["replay"]["joint_progress"] < 0.7:
-        # The landmarks' last digits, which differ between machines, decide whether a grip slips off by millimetres:
-        # then the hand that holds has to be within what its placement leaves open.
+    if name not in SLIPPERY:
+        assert row["replay"]["joint_progress"] >= 0.7
+    elif row["replay"]["joint_progress"] < 0.7:
+        # A hand that holds has to be within what its placement leaves open.
         found = refine(load_asset(row["asset"]), seconds=60)
         assert found.after.joint_progress >= 0.7
         assert max(found.after.controls.values()) < 0.1

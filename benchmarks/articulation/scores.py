@@ -35,9 +35,9 @@ def score(given: Given, answer: Answer, best: Bound | None) -> dict:
         "probability": max(answer.probability.values(), default=0.0), "seconds": answer.seconds,
         "failed": answer.axis is None, "type_right": answer.axis is not None and answer.type == kind,
     }  # fmt: skip
-    # Said with a verdict "ok" and a probability of 0.9 or more, and wrong.
+    # Wrong with a stated probability of 0.9 or more, whatever the verdict: `ambiguous` may be for another reason.
     row["confidently_wrong"] = bool(
-        answer.verdict == "ok" and answer.axis is not None and not row["type_right"] and row["probability"] >= CONFIDENT
+        answer.axis is not None and not row["type_right"] and row["probability"] >= CONFIDENT
     )
     if answer.axis is None:
         row |= {"axis_deg": FAILED_DEG, "location_mm": 1e3 * FAILED_M if hinge else None,

@@ -1,7 +1,7 @@
 """What half of the link would have said: the joint again from random halves of the link's regions.
 
-The covariance at the optimum (uncertainty.py) knows the noise of the tracks that are there, and one valley of the cost.
-It does not know that the tracks along one rim, of one face or of a shadow's edge err together, nor that another valley
+The covariance at the optimum (uncertainty.py) knows the noise of the tracks that are there, and one local minimum.
+It does not know that the tracks along one rim, of one face or of a shadow's edge err together, nor that another minimum
 lies next to it. Halves of the regions, drawn without replacement, scatter about the answer as much as answers do (the
 delete-d jackknife; Shao and Wu, "A general theory for jackknife variance estimation", Annals of Statistics 1989), and
 each half's joint is one more start for all tracks.
@@ -82,7 +82,12 @@ def widened(sure: Spread, b: Bundle, several: list[Half]) -> Spread:
     """The uncertainty, where halves of the link scatter by more than it says.
 
     Args:
-        sure: of the joint ``b``.  several: of :func:`halves`; with fewer than half of them nothing is known.
+        sure: of the joint.  b: the joint, as :func:`halves` returned it.
+        several: of :func:`halves`; with fewer than half of them nothing is known.
+
+    Returns:
+        Axis (deg), point and states (T,) (rad, units of the link's mean depth) with the larger standard deviation of
+        both; the rest is left.
     """
     if len(several) < HALVES / 2:
         return sure

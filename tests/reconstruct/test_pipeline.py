@@ -6,6 +6,7 @@ import base64
 import json
 import os
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -17,11 +18,14 @@ import numpy as np
 import pytest
 
 import taa_envs
+from reconstruct.cues import Hands, ProviderInfo
 from reconstruct.errors import Refused, TaaError
-from reconstruct.pipeline import Stages, fit_scene, reconstruct, with_advice
+from reconstruct.joint.fit import fit_joint
+from reconstruct.pipeline import Seen, Stages, fit_scene, reconstruct, with_advice
 from reconstruct.report import refusal_report, short
 from reconstruct.synth import load_truth, render_clip, write_cues
-from taa_envs.errors import AssetExists
+from taa_envs.errors import AssetExists, GateFailed
+from tests.reconstruct.joint_scenes import make_scene
 
 
 class Log:
@@ -192,6 +196,33 @@ def test_a_video_without_motion_is_refused_with_a_page(still, tmp_path):
     assert "; " in result.error
     assert not (tmp_path / "assets" / "still").exists()
     assert "Why there is no asset" in (tmp_path / "scene" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_doubtful_joint_whose_body_misbehaves_is_refused(tmp_path, monkeypatch):
+    """With a sure one it is an error: what is wrong then is the body, not the answer."""
+    scene = make_scene("revolute", [0.0, 1.0, 0.2], [-0.2, 0.0, 1.6], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.9)
+    nobody = Hands((), np.zeros(scene.video.frames.shape[:3], bool), ProviderInfo("none", "0", "Apache-2.0"))
+    fit = fit_joint(scene.video, scene.tracks, focal_px=768.0)
+    verdict = "ok"
+
+    def look(*_):
+        return Seen(scene.video, nobody, scene.tracks, replace(fit, verdict=verdict, reason="two fit"), (), (), True)
+
+    def build(*_):
+        raise GateFailed("it does not pass the gate: it does not come to rest")
+
+    monkeypatch.setattr("reconstruct.pipeline.load_video", lambda *_, **__: scene.video)
+    monkeypatch.setattr("reconstruct.pipeline.look", look)
+    monkeypatch.setattr("reconstruct.pipeline._build", build)
+    folders = dict(scene=tmp_path / "scene", out=tmp_path / "assets")
+    with pytest.raises(GateFailed):
+        reconstruct("any.mp4", "doubtful", **folders)
+    verdict = "ambiguous"
+    result = reconstruct("any.mp4", "doubtful", **folders)
+    assert result.as_dict()["asset"] is None and result.joint["verdict"] == "refused"
+    assert result.error == "two fit; it does not pass the gate: it does not come to rest"
+    assert "come to rest" in (tmp_path / "scene" / "report.html").read_text(encoding="utf-8")
+    assert not (tmp_path / "assets").exists()
 
 
 def test_a_camera_cut_is_refused(tmp_path):
