@@ -19,6 +19,7 @@ from reconstruct.joint.polish import (
     Bundle,
     Sightings,
     anchor_of,
+    cheapest,
     place_points,
     polish,
     radius_cost,
@@ -254,16 +255,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best, few = _together(best, few, paths, rest, view)
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
-    near: list[Bundle] = []
-    if still is None and _winner(type_probabilities(best, few)) == "prismatic":
-        hinge = best["revolute"]
-        every = [hinge, polish(hinge, few, hold=HELD), *(_refitted(b, hinge, few) for b in others.get("revolute", []))]
-        near = [b for b in every if radius_cost(b, few) < NEAR * b.sigma**2 * few.lasting and turn_deg(b) < 360]
-    probability = type_probabilities(best, few, near)
-    once = best[_winner(probability)]
-    last, several = halves(once, few)
-    sure = widened(spread(last, few), last, several)
-    rival = _rival(last, others.get(last.kind, []), few) if still is None else None
+    once, last, sure, probability, rival = _decided(best, others if still is None else None, few)
     weight = few.weight
     if few.link is not None:
         view = view.corrected(last, some)
@@ -283,6 +275,49 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
     first = None if once is last else whole(once)
     return Finished(whole(last), every, members, sure, probability, view, rival, first)
+
+
+def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | None, s: Sightings
+             ) -> tuple[Bundle, Bundle, Spread, dict[str, float], Rival | None]:  # fmt: skip
+    """The type, and its joint at its best.
+
+    Args:
+        best: of every type, the start that was better in the first round.
+        others: those that were not; None before a camera whose path is fitted with the joint, where every one would
+            need its own.
+        s: their observations.
+
+    Returns:
+        The joint as one adjustment found it, the better one that halves of the link, the other starts and the tracks
+        without strays lead to, its uncertainty, the types' probabilities, and the most probable other axis.
+    """
+    if others is None:
+        probability = type_probabilities(best, s)
+        last = best[_winner(probability)]
+        return last, last, spread(last, s), probability, None
+
+    def again(kind: str) -> list[Bundle]:
+        return [_refitted(b, best[kind], s) for b in others.get(kind, [])]
+
+    best, near = dict(best), []
+    hinges = [best["revolute"], *again("revolute")]
+    if _winner(type_probabilities(best, s)) == "prismatic":
+        every = [*hinges, polish(best["revolute"], s, hold=HELD)]
+        near = [b for b in every if radius_cost(b, s) < NEAR * b.sigma**2 * s.lasting and turn_deg(b) < 360]
+    else:
+        # Until the errors are known the priors weigh much, and strays prefer what they will: on all frames another
+        # start may be the better one.
+        best["revolute"] = cheapest(hinges, s)
+    probability = type_probabilities(best, s, near)
+    once = best[_winner(probability)]
+    other = [b for b in hinges if b is not once] if once.kind == "revolute" else again(once.kind)
+    better, several = halves(once, s)
+    clean = _without_strays([better, *(b for b in best.values() if b is not once), *other], s)
+    every = [polish(b, clean) for b in (better, *other)]
+    last = cheapest(every, clean)
+    # Halves scatter with the strays in them: what misleads is not always told from the link.
+    sure = widened(spread(last, clean), better, several)
+    return once, last, sure, probability, _rival(last, every, clean)
 
 
 def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sightings:
@@ -315,6 +350,18 @@ def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sight
     flex = min(FLEX_PX, FLEX_SIGMAS * sigma)
     alike = (flex**2 * rho + restless**2) * 0.5 * float(sight.seen.sum(1).mean()) / sigma**2
     return replace(sight, weight=shared_weights(rho, cluster), lasting=max(sight.lasting, alike))
+
+
+def _without_strays(joints: Sequence[Bundle], sight: Sightings) -> Sightings:
+    """The sightings of a link without the stretches in which tracks have left the points of every joint at hand.
+
+    A stray that stays within reach of the loss bends the axis of a small motion. Types are weighed, and a joint is
+    believed, with them: many that leave its points together say that there is no such joint.
+    """
+    lost = sight.seen.copy()
+    for b in joints:
+        lost &= strayed(residuals(b, sight), sight.seen, max(b.sigma, 0.05), sight.lasting)
+    return replace(sight, seen=sight.seen & ~lost)
 
 
 def _spread_out(count: int, most: int) -> np.ndarray:
@@ -506,18 +553,15 @@ def _refitted(b: Bundle, like: Bundle, sight: Sightings) -> Bundle:
 
 
 def _rival(last: Bundle, others: Sequence[Bundle], sight: Sightings) -> Rival | None:
-    """The most probable other axis, each fitted to the answer's own tracks.
+    """The most probable other axis, of joints that are fitted to the answer's own tracks.
 
     A small motion is seen nearly as from afar, and from there a body and its mirror image that turns the other way look
     the same (Necker's reversal): what is stated of one optimum knows nothing of the next.
     """
     found: list[Rival] = []
     for b in others:
-        if _apart_deg(b, last) < APART_DEG:
-            continue
-        fitted = _refitted(b, last, sight)
-        if (apart := _apart_deg(fitted, last)) > APART_DEG:
-            odds = tempered(_gain(last, fitted, sight), _votes(last, fitted, sight))
+        if (apart := _apart_deg(b, last)) > APART_DEG:
+            odds = tempered(_gain(last, b, sight), _votes(last, b, sight))
             found.append(Rival(apart, float(expit(-odds))))
     return max(found, key=lambda r: r.probability, default=None)
 

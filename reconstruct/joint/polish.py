@@ -9,6 +9,7 @@ observations drop out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -386,6 +387,20 @@ def radius_cost(b: Bundle, s: Sightings) -> float:
     """px^2 that the radius of a hinge costs beyond what the tracks do: many times as far away as links are large is a
     slide, bent by strays."""
     return _Priors.of(b, s, b.sigma).radius_cost(b)
+
+
+def cheapest(bundles: Sequence[Bundle], s: Sightings) -> Bundle:
+    """Of joints of one type that are fitted to the same tracks, the one that costs least, all by the smallest noise.
+
+    Each one's own cost is by a loss as wide as its own noise, and a wider loss charges more for every stray.
+    """
+    limit = ROBUST_SIGMAS * max(min(b.sigma for b in bundles), 0.05)
+
+    def cost(b: Bundle) -> float:
+        priors = _Priors.of(b, s, b.sigma)
+        return robust_loss(residuals(b, s), s, limit)[0] + priors.cost(b) + priors.radius_cost(b)
+
+    return min(bundles, key=cost)
 
 
 def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = None, sharpen: bool = True,

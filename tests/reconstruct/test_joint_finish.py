@@ -1,0 +1,75 @@
+"""The end of the fit: which start is taken, and what strays that stay near do to it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruct.joint.finish import View, _decided, finish
+from reconstruct.joint.paths import Paths
+from reconstruct.joint.polish import Bundle, cheapest, place_points, polish
+from reconstruct.joint.twist import Twist
+from tests.reconstruct.test_joint_polish import FOCAL, scene
+
+
+def off_deg(b: Bundle, truth: Bundle) -> float:
+    return float(np.degrees(np.arccos(np.clip(abs(b.twist.axis @ truth.twist.axis), 0, 1))))
+
+
+def wandering(uv: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """A share of the tracks lets go of its point and wanders off slowly."""
+    rng = np.random.default_rng(seed)
+    N, T = uv.shape[:2]
+    out = uv.copy()
+    for i in rng.permutation(N)[: round(share * N)]:
+        start = int(rng.integers(T // 2))
+        out[i, start:] += np.cumsum(rng.normal(scale=0.3, size=(T - start, 2)), axis=0)
+    return out
+
+
+def mirrored(b: Bundle) -> Bundle:
+    """The link's mirror image along the line of sight, which turns the other way: from afar they look the same."""
+    flip = np.array([1.0, 1.0, -1.0])
+    middle = np.median(b.X, axis=0)
+    X = middle + (b.X - middle) * flip
+    anchor = middle + (b.twist.anchor - middle) * flip
+    # Axial vectors keep the component along the normal of the mirror and turn the others.
+    return replace(b, X=X, twist=Twist(anchor, b.twist.direction * flip, -b.twist.curvature * flip))
+
+
+def test_strays_that_stay_near_do_not_bend_a_small_motion():
+    with_strays, alone = [], []
+    for seed in range(4):
+        truth, s = scene("revolute", seed, points=80, frames=60, stroke=0.17)
+        for uv, out in ((wandering(s.uv, 0.25, seed), with_strays), (s.uv, alone)):
+            done = finish({"revolute": [truth]}, Paths(uv, None), np.arange(len(uv)), View(FOCAL))
+            out.append(off_deg(done.bundle, truth))
+    assert np.median(with_strays) < 2 * np.median(alone)
+
+
+def test_a_start_that_the_first_round_prefers_wrongly_is_found_out():
+    """Until the errors are known the priors weigh much, and strays may prefer another axis."""
+    truth, s = scene("revolute", 3, points=60, frames=40, stroke=0.25)
+    away = polish(place_points(mirrored(truth), s), s, iterations=30)
+    assert off_deg(away, truth) > 20
+    best = {"revolute": away, "prismatic": polish(_slide(away), s), "screw": polish(replace(away, kind="screw"), s)}
+    once, last, sure, probability, rival = _decided(best, {"revolute": [truth]}, s)
+    assert once.kind == "revolute" and probability["revolute"] > 0.9
+    assert off_deg(once, truth) < 1 and off_deg(last, truth) < 1
+    assert sure.axis_deg < 2
+    assert rival is not None and rival.apart_deg > 20 and rival.probability < 0.1
+
+
+def _slide(hinge: Bundle) -> Bundle:
+    direction = hinge.twist.direction / np.linalg.norm(hinge.twist.direction)
+    return replace(hinge, kind="prismatic", twist=Twist(hinge.twist.anchor, direction, np.zeros(3)))
+
+
+def test_joints_are_compared_by_one_noise():
+    truth, s = scene("revolute", 0)
+    rng = np.random.default_rng(0)
+    seen = rng.uniform(size=s.seen.shape) < 0.7
+    s = replace(s, uv=s.uv + (~seen)[..., None] * rng.normal(scale=50, size=s.uv.shape))
+    good = polish(truth, s, iterations=30)
+    worse = polish(place_points(mirrored(truth), s), s, iterations=30)
+    assert cheapest([worse, good], s) is good
+    assert cheapest([replace(good, cost=np.inf), worse], s) is not worse
