@@ -89,8 +89,8 @@ class Finished:
         spread: its uncertainty.  probability: of each type.
         view: focal length and camera, whose path is fitted together with the joint where it moves.
         rival: the most probable of the other axes that were among the starts.
-        once: the bundle as one adjustment found it, before halves of the link led to a better one; that where None. A
-            free body is fitted once as well, and is held against this.
+        once: the bundle as one adjustment of all tracks found it, before halves of the link and the tracks without
+            strays led to a better one; that where None. A free body is fitted once as well, and is held against this.
     """
 
     bundle: Bundle
