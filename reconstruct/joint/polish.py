@@ -390,9 +390,13 @@ def radius_cost(b: Bundle, s: Sightings) -> float:
 
 
 def cheapest(bundles: Sequence[Bundle], s: Sightings) -> Bundle:
-    """Of joints of one type that are fitted to the same tracks, the one that costs least, all by the smallest noise.
+    """The one that costs least (px^2, priors included), all by the smallest noise among them.
 
     Each one's own cost is by a loss as wide as its own noise, and a wider loss charges more for every stray.
+
+    Args:
+        bundles: joints of one type, at least one, each with the points (N, 3) of the same tracks.
+        s: observations of these tracks.
     """
     limit = ROBUST_SIGMAS * max(min(b.sigma for b in bundles), 0.05)
 
