@@ -332,14 +332,16 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.fit import fit_joint, moving_tracks
+    from reconstruct.providers.lk_tracks import pictures_of
 
+    pictures = pictures_of(video, hands)
     arm = on_forearm(tracks, hands)
     share = float(np.mean(arm[moving])) if len(moving := moving_tracks(video, tracks)) else 0.0
     rest = replace(tracks, visible=tracks.visible & ~arm[:, None]) if share > 0 else tracks
     lit = _off_shadows(video, rest)
 
     def ask(some: Tracks) -> JointFit:
-        return fit_joint(video, some, focal, seed, progress, camera_moving=False)
+        return fit_joint(video, some, focal, seed, progress, camera_moving=False, pictures=pictures)
 
     fit, asked = ask(lit), lit
     if fit.verdict == "refused" and lit is not rest:

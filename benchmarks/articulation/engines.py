@@ -91,8 +91,10 @@ def _without_depth(given: Given, focal_known: bool, seed: int) -> JointFit:
     from reconstruct.pipeline import joint_off_the_arm
 
     T = given.uv.shape[1]
-    blank = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
-    video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, blank, 1.0)
+    frames = given.frames
+    if frames is None:
+        frames = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
+    video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, frames, 1.0)
     tracks = Tracks(given.uv.astype(np.float32), given.visible, given.scene.seed, PROVIDER, given.slip, given.shade,
                     given.cast)  # fmt: skip
     focal = float(given.scene.shot.K[0, 0]) if focal_known else None

@@ -30,6 +30,7 @@ class Given:
         wrong: (N, T) bool, truth: not an observation of its point.
         sigma_px, sigma_depth (of the logarithm), sigma_field: standard deviations of the noise; zeros in row 1.
         hands: detected ones, slip, shade, cast: of the tracks, as in :class:`Tracks`; row 4 only.
+        frames: (T, h, w, 3) uint8 BGR; row 4 only.
     """
 
     scene: Scene
@@ -46,6 +47,7 @@ class Given:
     slip: np.ndarray | None = None
     shade: np.ndarray | None = None
     cast: np.ndarray | None = None
+    frames: np.ndarray | None = None
 
 
 def field_basis(uv: np.ndarray) -> np.ndarray:

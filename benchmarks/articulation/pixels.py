@@ -57,7 +57,7 @@ def film(model: Model, motion: str, texture: str, small: bool = False, seed: int
     if not len(tracks.uv):
         raise Hidden(f"{model.name}: nothing was tracked")
     known = _known(model, motion, small, shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
-    return replace(known, hands=hands, slip=tracks.slip, shade=tracks.shade, cast=tracks.cast)
+    return replace(known, hands=hands, slip=tracks.slip, shade=tracks.shade, cast=tracks.cast, frames=video.frames)
 
 
 def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, visible: np.ndarray,

@@ -11,6 +11,7 @@ from reconstruct.cues import Tracks
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import free_motion
+from reconstruct.joint.faces import by_faces
 from reconstruct.joint.finish import (
     Finished,
     NoLink,
@@ -24,6 +25,7 @@ from reconstruct.joint.groups import Rigid, two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
+from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.result import MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
@@ -79,6 +81,7 @@ def fit_joint(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
     camera_moving: bool | None = None,
+    pictures: Pictures | None = None,
 ) -> JointFit:
     """Joint type, axis, states and the moving link's points from tracks of one camera.
 
@@ -91,6 +94,8 @@ def fit_joint(
         camera_moving: whether the camera moves; judged from how many tracks keep their place when None. A moving one
             is found together with the joint, from the static scene's tracks; the world is then up to the first camera.
             Where it is not said and all tracks move as one body, the answer is "ambiguous".
+        pictures: of the video's frames, working px. Where the camera rests, a hinge that the link's whole faces hold
+            better than the tracks do is taken from them.
 
     Returns:
         A JointFit up to scale (median depth of the link = 1), or one with verdict "refused".
@@ -112,7 +117,7 @@ def fit_joint(
             return fit or JointFit("refused", NO_SCENE, tracks=len(paths))
     answer, most = None, 0.0
     for k in range(TRIES):
-        fit, worth = _one_draw(video, paths, camera, view, known, rng, lambda x, k=k: tell((k + x) / TRIES))
+        fit, worth = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES))
         # Asked often enough something may pass for a joint: a later draw has to explain what the others missed.
         if fit.verdict != "refused" and worth > LUCKIER * most:
             answer = fit
@@ -156,12 +161,13 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
-              tell: Callable[[float], None]) -> tuple[JointFit, float]:  # fmt: skip
+              pictures: Pictures | None, tell: Callable[[float], None]) -> tuple[JointFit, float]:  # fmt: skip
     """The joint before a camera that rests or is held in a hand, by one draw of hypotheses, and the motion it explains.
 
     Args:
         paths: of all tracks, working px.
         known: focal length in full px, None where the prior's mean is taken.
+        pictures: whose faces may hold the joint better than the tracks do; None where the tracks are all there is.
     """
     note = ""
     found = _consensus(paths, camera, rng, lambda x: tell(0.85 * x))
@@ -190,6 +196,8 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
         return JointFit("refused", NO_LINK, tracks=len(paths), inliers=len(found.members)), found.explained
     if reason := why_not_believed(done, restless):
         return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members)), found.explained
+    if pictures is not None and video.warp is None and (exact := by_faces(done, pictures)) is not done:
+        done, note = exact, f"{note}; its faces' pixels hold the axis"
     full = camera.focal / video.scale
     return result_of(video, done, full, len(paths), note, KNOWN_STD if known else None), found.explained
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo, Tracks
+from reconstruct.joint.photometric import Pictures
 from reconstruct.providers.affine import SPREAD, register
 from reconstruct.providers.shade import BY_THEN, one_colour, rest_beneath
 from reconstruct.video import Video
@@ -83,6 +84,18 @@ def even_exposure(video: Video) -> list[np.ndarray]:
     return out
 
 
+def pictures_of(video: Video, hands: Hands | None = None) -> Pictures:
+    """The frames as points are followed in them: of even exposure, and nothing under hands."""
+    import cv2
+
+    h, w = video.frames.shape[1:3]
+    covered = np.zeros((len(video), h, w), bool)
+    if hands is not None and hands.mask is not None:
+        k = np.ones((11, 11), np.uint8)
+        covered = np.stack([cv2.dilate(m.astype(np.uint8), k) for m in hands.mask]) > 0
+    return Pictures(np.stack(even_exposure(video)), covered, np.array([(w - 1) / 2, (h - 1) / 2]))
+
+
 def change_region(video: Video, dilate: int = 9) -> np.ndarray:
     """(h, w) bool, pixels whose smoothed brightness ever differs clearly from another time's."""
     import cv2
@@ -134,15 +147,12 @@ def track_points(
 
     references = reference_frames(video, hands) if references is None else np.asarray(references)
     region = change_region(video)
-    covered = None
-    if hands is not None and hands.mask is not None:
-        k = np.ones((11, 11), np.uint8)
-        covered = np.stack([cv2.dilate(m.astype(np.uint8), k) for m in hands.mask]) > 0
-    grey = np.stack(even_exposure(video))
+    seen = pictures_of(video, hands)
+    grey, covered = seen.grey, seen.covered
     seeds, frames = [], []
     inner = enclosed(region)
     for k, r in enumerate(references):
-        free = np.ones_like(region) if covered is None else ~covered[r]
+        free = ~covered[r]
         p = _corners(grey[r], region & free, per_reference)
         if k % INNER_EVERY == 0:
             p = np.concatenate([p, _corners(grey[r], inner & free, INNER_SEEDS)])
@@ -164,7 +174,7 @@ def track_points(
                   *_shadows(video, uv, covered))  # fmt: skip
 
 
-def _shadows(video: Video, uv: np.ndarray, covered: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def _shadows(video: Video, uv: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) bool each, ``shade`` and ``cast`` as in :class:`Tracks`; the second is asked of what moves only."""
     shade = one_colour(video.frames, uv)
     cast = np.zeros(len(uv), bool)
@@ -234,7 +244,7 @@ def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
 
 
 def _follow(
-    grey: np.ndarray, order: list[int], uv: np.ndarray, reference: np.ndarray, covered: np.ndarray | None
+    grey: np.ndarray, order: list[int], uv: np.ndarray, reference: np.ndarray, covered: np.ndarray
 ) -> None:
     """Extend all tracks along `order` (in place); each starts when its reference frame comes up."""
     import cv2
@@ -258,10 +268,9 @@ def _follow(
         n = n.reshape(-1, 2)
         x, y = n[:, 0], n[:, 1]
         good &= (x > 4) & (y > 4) & (x < w - 5) & (y < h - 5)
-        if covered is not None:
-            inside = good.copy()
-            inside[good] = covered[t][y[good].round().astype(int), x[good].round().astype(int)]
-            good &= ~inside
+        inside = good.copy()
+        inside[good] = covered[t][y[good].round().astype(int), x[good].round().astype(int)]
+        good &= ~inside
         alive[ids[~good]] = False
         ids, n = ids[good], n[good]
         uv[ids, t] = n

@@ -72,7 +72,7 @@ def _asked(share, monkeypatch, refuses, on_the_arm=False):
     tracks = Tracks(uv, np.ones(uv.shape[:2], bool), np.zeros(100, int), MADE)
     arms, asked = np.arange(100) < len(sleeve), []
 
-    def search(video, tracks, focal, seed, progress, camera_moving):
+    def search(video, tracks, focal, seed, progress, camera_moving, pictures):
         asked.append(tracks.visible.any(1))
         if refuses(bool(asked[-1][arms].any())):
             return JointFit("refused", "a free body")
