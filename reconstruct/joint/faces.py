@@ -86,9 +86,10 @@ def by_faces(done: Finished, pictures: Pictures, seed: int = 0) -> Finished:
         face[face >= 0] = on.ravel()
         s = replace(s, planes=s.planes[used])
         pick = np.sort(rng.permutation(len(px))[: min(MOST_PIXELS, MOST_SAMPLES // len(frames))])
-        adjustment = Adjustment(reader, px[pick], face[face >= 0][pick], sight.focal_std, held)
+        share = len(pick) / len(px)
+        adjustment = Adjustment(reader, px[pick], face[face >= 0][pick], share, sight.focal_std, held)
         s, _ = adjustment.solve(s)
-    sure = spread_of(adjustment, s, len(pick) / len(px))
+    sure = spread_of(adjustment, s)
     turned = abs(float(s.twist.axis @ b.twist.axis))
     apart = float(np.degrees(np.arccos(min(turned, 1.0)))) / 1.96
     if apart > np.hypot(sure.axis_deg, done.spread.axis_deg):

@@ -55,7 +55,7 @@ class Surface:
     """A joint before a resting camera, and the faces of the link that it moves.
 
     Attributes:
-        kind: of the joint.  twist: in the camera's frame.  q: (T,) path length at its anchor.
+        kind: "revolute".  twist: in the camera's frame.  q: (T,) path length at its anchor.
         log_focal: correction of the focal length's logarithm.
         planes: (F, 3) a, b, c of inverse depths a + b x + c y in one frame, x and y in focal lengths from the centre.
         frame: that frame, an index into q: the faces' pixels are named by where they are there.
@@ -141,12 +141,16 @@ class Adjustment:
 
     Args:
         reader: of the pictures.  xy: (N, 2) the pixels in the surface's frame, px from the centre.  face: (N,) theirs.
+        share: of the faces' pixels that these are.
         focal_std: of the focal length's logarithm; 0 where it is known.
         q_std: (T,) by which states may leave where they start: what holds those whose frames show nothing.
     """
 
-    def __init__(self, reader: Reader, xy: np.ndarray, face: np.ndarray, focal_std: float, q_std: np.ndarray) -> None:
+    def __init__(self, reader: Reader, xy: np.ndarray, face: np.ndarray, share: float, focal_std: float,
+                 q_std: np.ndarray) -> None:  # fmt: skip
         self.reader, self.xy, self.face = reader, xy, face
+        # So many pixels weigh against a prior as one: smoothing has made the errors of neighbours alike.
+        self.alike = MODEL**2 * max(1.0, 4 * np.pi * BLUR**2 * share)
         self.focal_std, self.q_std = focal_std, q_std
         self.groups = []
         for k in np.unique(face):
@@ -264,13 +268,14 @@ class Adjustment:
         g[P:] = np.sum(wJq * r, axis=1)
         scores = np.concatenate([np.sum(w * J * r, axis=1).T, (wJq * r).T], axis=1)
         # What is known besides.
-        prior = noise**2 / np.maximum(self.q_std, 1e-9) ** 2
+        white = noise**2 * self.alike
+        prior = white / np.maximum(self.q_std, 1e-9) ** 2
         H[P:, P:] += np.diag(prior)
         g[P:] += prior * (s.q - start.q)
         if self.focal_std > 0:
             G = Z.shape[1]
-            H[G, G] += noise**2 / self.focal_std**2
-            g[G] += noise**2 / self.focal_std**2 * s.log_focal
+            H[G, G] += white / self.focal_std**2
+            g[G] += white / self.focal_std**2 * s.log_focal
         return H, g, scores
 
     def solve(self, s: Surface, steps: int = STEPS) -> tuple[Surface, float]:
@@ -323,20 +328,13 @@ def _summary(s: Surface, xy: np.ndarray, face: np.ndarray, focal: float) -> tupl
     inverse = s.inverse_depths(xy, face, focal)
     X = np.concatenate([xy / (focal * np.exp(s.log_focal)), np.ones((len(xy), 1))], axis=1) / inverse[:, None]
     unit = float(np.mean(X[:, 2]))
-    tw = s.twist
-    if s.kind == "prismatic":
-        return tw.direction, np.zeros(3), (s.q - s.q[0]) / unit
-    middle = X.mean(0) / unit
+    tw, middle = s.twist, X.mean(0) / unit
     c = tw.point / unit
     return tw.axis, c + tw.axis * (tw.axis @ (middle - c)), (s.q - s.q[0]) * float(np.linalg.norm(tw.curvature))
 
 
-def spread_of(a: Adjustment, s: Surface, density: float) -> Spread:
-    """Covariances at the optimum: of white noise as smoothing left it, and of blocks that err each in its own way.
-
-    Args:
-        density: share of the faces' pixels that are used.
-    """
+def spread_of(a: Adjustment, s: Surface) -> Spread:
+    """Covariances at the optimum: of white noise as smoothing left it, and of blocks that err each in its own way."""
     v, gx, gy, seen = a.read(s)
     r, w, noise = a.settle(v, seen, None)
     Z = s.twist.tangent(s.kind)
@@ -361,7 +359,7 @@ def spread_of(a: Adjustment, s: Surface, density: float) -> Spread:
     np.add.at(sums, block, scores)
     sums[:, still] = 0.0
     half = sums @ B * np.sqrt(len(sums) / max(len(sums) - 1, 1))
-    white = noise**2 * max(1.0, 4 * np.pi * BLUR**2 * density)
+    white = noise**2 * a.alike
     base = _summary(s, a.xy, a.face, a.reader.focal)
     rows = [np.zeros((len(x), len(g))) for x in base]
     sizes = np.concatenate([np.full(P, 1e-5), np.full(T, 1e-5 * max(float(np.ptp(s.q)), 1e-9))])
@@ -372,13 +370,14 @@ def spread_of(a: Adjustment, s: Surface, density: float) -> Spread:
             row[:, k] = (y - x) / sizes[k]
 
     def variance(L: np.ndarray) -> np.ndarray:
-        return MODEL**2 * np.maximum(white * np.einsum("kp,pq,kq->k", L, B, L), np.sum((half @ L.T) ** 2, axis=0))
+        plain = white * np.einsum("kp,pq,kq->k", L, B, L)
+        return np.maximum(plain, MODEL**2 * np.sum((half @ L.T) ** 2, axis=0))
 
     axis = variance(rows[0])
     plain = noise**2 * np.einsum("kp,pq,kq->k", rows[0], B, rows[0]).sum()
     by_w = np.zeros((3, len(g)))
     by_w[:, : Z.shape[1]] = Z[3:]
-    curvature = MODEL**2 * white * by_w @ B @ by_w.T
+    curvature = white * by_w @ B @ by_w.T
     G = Z.shape[1]
     focal = float(np.sqrt(variance(np.eye(len(g))[G : G + 1])[0])) if a.focal_std > 0 else 0.0
     q = np.sqrt(variance(rows[2]))

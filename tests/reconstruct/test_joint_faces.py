@@ -1,18 +1,22 @@
 """The joint from whole faces: what is found in rendered plates of faint paint, and what is left alone."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.faces import WORTH_DEG, belonging, by_faces
 from reconstruct.joint.finish import Finished, View
+from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.photometric import Adjustment, Pictures, Reader, Surface, spread_of
 from reconstruct.joint.polish import Bundle, Sightings, polish
 from reconstruct.joint.twist import Twist
 from reconstruct.joint.uncertainty import spread
+from reconstruct.video import Video
 
 W, H, FOCAL, T = 320, 240, 300.0, 30
 CENTRE = np.array([(W - 1) / 2, (H - 1) / 2])
@@ -105,14 +109,14 @@ def off_deg(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b))))
 
 
-def adjustment(plate: Plate, count: int = 3000) -> tuple[Adjustment, float]:
-    """Of pixels well within the plate, and the share of these that is used."""
+def adjustment(plate: Plate, count: int = 3000, focal: float = FOCAL, focal_std: float = 0.0) -> Adjustment:
+    """Of pixels well within the plate."""
     inner = cv2.erode(plate.on(FRAME).astype(np.uint8), np.ones((9, 9), np.uint8))
     y, x = np.nonzero(inner)
     pick = np.random.default_rng(0).permutation(len(x))[:count]
     xy = np.stack([x, y], axis=1)[pick] - CENTRE
-    reader = Reader(plate.pictures, np.arange(T), FOCAL)
-    return Adjustment(reader, xy, np.zeros(len(xy), int), 0.0, np.full(T, 0.1)), len(xy) / len(x)
+    reader = Reader(plate.pictures, np.arange(T), focal)
+    return Adjustment(reader, xy, np.zeros(len(xy), int), len(xy) / len(x), focal_std, np.full(T, 0.1))
 
 
 @pytest.mark.slow
@@ -120,21 +124,31 @@ def test_faint_paint_holds_an_axis_within_what_is_stated():
     off, stated = [], []
     for seed in range(6):
         plate = film(seed)
-        a, share = adjustment(plate)
+        a = adjustment(plate)
         s, noise = a.solve(plate.surface(off_deg=12.0))
         assert noise < NOISE / 2  # smoothed
         off.append(off_deg(s.twist.axis, plate.axis))
-        stated.append(spread_of(a, s, share).axis_deg)
+        stated.append(spread_of(a, s).axis_deg)
     assert max(off) < 2.0
     z = np.array(off) / stated
     # Twice of what noise explains is stated (MODEL), and these plates are plane.
     assert np.all(z < 1.96) and np.sqrt(np.mean(z**2)) > 0.15
 
 
+def test_an_unknown_focal_length_is_stated_no_wider_than_it_was_known_to_be():
+    plate = film(1)
+    a = adjustment(plate, focal=1.08 * FOCAL, focal_std=0.12)
+    s, _ = a.solve(plate.surface())
+    stated = spread_of(a, s)
+    assert 0.01 < stated.log_focal <= 0.121
+    assert abs(np.log(1.08) + s.log_focal) < 1.96 * 0.12
+    assert off_deg(s.twist.axis, plate.axis) < 1.96 * stated.axis_deg
+
+
 def test_what_light_does_to_a_face_is_no_motion():
     """With the truth as the start, a plate that darkens, loses contrast and does so unevenly stays where it is."""
     plate = film(1, light=1.5)
-    a, _ = adjustment(plate)
+    a = adjustment(plate)
     s, _ = a.solve(plate.surface())
     rate = float(np.linalg.norm(s.twist.curvature))
     assert np.degrees(np.abs((s.q - s.q[0]) * rate - plate.q)).max() < 0.5
@@ -218,3 +232,20 @@ def test_tracks_that_hold_the_axis_are_believed():
     done = by_tracks(plate, 0)
     sure = replace(done, spread=replace(done.spread, axis_deg=0.5 * WORTH_DEG))
     assert by_faces(sure, plate.pictures) is sure
+
+
+@pytest.mark.slow
+def test_the_fit_says_that_faces_hold_the_axis():
+    plate = film(3, turn_deg=15.0, fine=5.0)
+    rng = np.random.default_rng(0)
+    uv = by_tracks(plate, 0).sight.uv + CENTRE + rng.normal(scale=0.3, size=(90, T, 2))
+    rest = np.repeat(rng.uniform([5, 5], [W - 5, H - 5], (60, 2))[:, None], T, axis=1)
+    uv = np.concatenate([uv, rest + rng.normal(scale=0.1, size=rest.shape)]).astype(np.float32)
+    video = Video(Path("plate.mp4"), "0" * 64, (W, H), np.arange(T) / 30, np.arange(T), T,
+                  np.repeat(plate.pictures.grey[..., None], 3, axis=-1), 1.0)  # fmt: skip
+    tracks = Tracks(uv, np.ones(uv.shape[:2], bool), np.zeros(len(uv), int), ProviderInfo("test", "1", "Apache-2.0"))
+    old, new = (fit_joint(video, tracks, FOCAL, camera_moving=False, pictures=p) for p in (None, plate.pictures))
+    assert "pixels" in new.reason and "pixels" not in old.reason
+    assert new.type == "revolute" and new.std["axis_deg"] < old.std["axis_deg"]
+    off = off_deg(np.asarray(new.T_camera_world)[:3, :3] @ new.axis, plate.axis)
+    assert off < 1.96 * new.std["axis_deg"] and off < 2.0
