@@ -190,7 +190,7 @@ class Adjustment:
         return out
 
     def draw(self, v: np.ndarray, w: np.ndarray) -> None:
-        """The faces' own picture into what shading may be, by its deviation in standard deviations."""
+        """Let shading change the contrast of the faces' own picture, as grey values v by weights w, (T, N), show it."""
         even = self.without(v, w, self.shading(w), own=False)
         own = (w * even).sum(0) / np.maximum(w.sum(0), 1e-6)
         for on, B in self.groups:
@@ -279,7 +279,14 @@ class Adjustment:
         return H, g, scores
 
     def solve(self, s: Surface, steps: int = STEPS) -> tuple[Surface, float]:
-        """Levenberg-Marquardt with weights that follow the residuals; the surface, and the noise of grey values."""
+        """Levenberg-Marquardt with weights that follow the residuals.
+
+        Args:
+            s: start.  steps: at most.
+
+        Returns:
+            The surface, and the noise of one smoothed pixel, grey values.
+        """
         start, damping = s, 1e-3
         v, gx, gy, seen = self.read(s)
         self.draw(v, seen.astype(np.float32))
@@ -334,7 +341,10 @@ def _summary(s: Surface, xy: np.ndarray, face: np.ndarray, focal: float) -> tupl
 
 
 def spread_of(a: Adjustment, s: Surface) -> Spread:
-    """Covariances at the optimum: of white noise as smoothing left it, and of blocks that err each in its own way."""
+    """Covariances at the optimum: of white noise as smoothing left it, and of blocks that err each in its own way.
+
+    Of both the larger variance is stated, times MODEL squared; units as in :class:`Spread`, of the faces' mean depth.
+    """
     v, gx, gy, seen = a.read(s)
     r, w, noise = a.settle(v, seen, None)
     Z = s.twist.tangent(s.kind)
