@@ -103,6 +103,18 @@ def _read(images: np.ndarray, covered: np.ndarray, at: np.ndarray, slopes: bool,
                 down[t, n] = 0.5 * ((1 - b) * d0 + b * d1)
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _project(R: np.ndarray, p: np.ndarray, X: np.ndarray, f: float, centre: np.ndarray, out: np.ndarray) -> None:
+    """Pixels (T, N, 2) of points X (N, 3) carried by R (T, 3, 3) and p (T, 3), by a camera of focal length f."""
+    for t in range(len(R)):
+        r, o = R[t], p[t]
+        for n in range(len(X)):
+            x, y, z = X[n, 0], X[n, 1], X[n, 2]
+            scale = f / max(r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + o[2], 1e-3)
+            out[t, n, 0] = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + o[0]) * scale + centre[0]
+            out[t, n, 1] = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + o[1]) * scale + centre[1]
+
+
 class Reader:
     """The smoothed pictures of some frames, and where a surface's points are seen in them.
 
@@ -126,8 +138,9 @@ class Reader:
         f = self.focal * np.exp(s.log_focal)
         X = np.concatenate([xy / f, np.ones((len(xy), 1))], axis=1) / inverse[:, None]
         R, p = s.twist.pose(s.q - s.q[s.frame])
-        Y = np.einsum("tij,nj->tni", R, X - s.twist.anchor) + (p + s.twist.anchor)[:, None]
-        return f * Y[..., :2] / np.maximum(Y[..., 2:], 1e-3) + self.centre
+        out = np.empty((len(R), len(X), 2))
+        _project(R, p + s.twist.anchor - R @ s.twist.anchor, X, f, np.asarray(self.centre, float), out)
+        return out
 
     def read(self, at: np.ndarray, slopes: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Grey values at (T, N, 2) px, and their derivatives to the right and down, (T, N) each; NaN where not seen."""
