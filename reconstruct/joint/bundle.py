@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.hypotheses import perpendicular_basis
@@ -84,17 +85,33 @@ def transport(s: State, obs: Observations) -> tuple[np.ndarray, np.ndarray]:
     if s.kind == "prismatic":
         X = (s.depth[:, None] * rays)[:, None] + ((s.q[None, :] - s.q[obs.ref][:, None])[..., None] * s.axis)
         return X, np.broadcast_to(rays[:, None], X.shape)
-    dq = s.q[None, :] - s.q[obs.ref][:, None]  # (N, K)
-    cos, sin = np.cos(dq)[..., None], np.sin(dq)[..., None]
-    a, c = s.axis, s.point
-
-    def rotate(v: np.ndarray) -> np.ndarray:  # (N, 3) -> (N, K, 3), Rodrigues
-        along = (v @ a)[:, None, None] * a
-        return along + cos * (v[:, None] - along) + sin * np.cross(a, v)[:, None]
-
-    D = rotate(rays)
-    X = s.depth[:, None, None] * D + c - rotate(np.broadcast_to(c, rays.shape))
+    X, D = np.empty((*obs.seen.shape, 3)), np.empty((*obs.seen.shape, 3))
+    _carried(rays, s.depth, s.q, obs.ref, s.axis, s.point, X, D)
     return X, D
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turned(v0: float, v1: float, v2: float, a: np.ndarray, cos: float, sin: float) -> tuple[float, float, float]:
+    """A vector turned about an axis (Rodrigues)."""
+    along = (1.0 - cos) * (v0 * a[0] + v1 * a[1] + v2 * a[2])
+    return (along * a[0] + cos * v0 + sin * (a[1] * v2 - a[2] * v1),
+            along * a[1] + cos * v1 + sin * (a[2] * v0 - a[0] * v2),
+            along * a[2] + cos * v2 + sin * (a[0] * v1 - a[1] * v0))  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _carried(rays: np.ndarray, depth: np.ndarray, q: np.ndarray, ref: np.ndarray, a: np.ndarray, c: np.ndarray,
+             X: np.ndarray, D: np.ndarray) -> None:  # fmt: skip
+    """Points that turn about an axis a through c, and their derivatives by depth, (N, K, 3)."""
+    for n in range(X.shape[0]):
+        for k in range(X.shape[1]):
+            dq = q[k] - q[ref[n]]
+            cos, sin = np.cos(dq), np.sin(dq)
+            d = _turned(rays[n, 0], rays[n, 1], rays[n, 2], a, cos, sin)
+            p = _turned(c[0], c[1], c[2], a, cos, sin)
+            for i in range(3):
+                D[n, k, i] = d[i]
+                X[n, k, i] = depth[n] * d[i] + c[i] - p[i]
 
 
 def reprojection(X: np.ndarray, obs: Observations) -> np.ndarray:
@@ -219,49 +236,93 @@ def _apply(s: State, step: np.ndarray, depth: np.ndarray, K: int) -> State:
 def normal_equations(s: State, obs: Observations, X, D, r, w):
     """Gauss-Newton blocks: (joint, q) dense part, per-track depth part, coupling."""
     N, K = obs.seen.shape
-    z = np.maximum(X[..., 2], 1e-3)
-
-    def image(dX: np.ndarray) -> np.ndarray:  # (N, K, 3) -> (N, K, 2) px
-        return held((dX[..., :2] - X[..., :2] / z[..., None] * dX[..., 2:]) / z[..., None] / obs.px, obs.slip)
-
-    Jl = image(D)
+    h = 1e-5
     if s.kind == "prismatic":
-        dq = (s.q[None, :] - s.q[obs.ref][:, None])[..., None]
-        basis = perpendicular_basis(s.axis)
-        Jg = [image(dq * basis[:, k]) for k in range(2)]
-        Jq = image(np.broadcast_to(s.axis, X.shape))
+        moved, still = perpendicular_basis(s.axis).T, np.zeros((2, 3))
     else:
         # Derivatives by the joint are numerical (three of them): the analytic ones are long and no faster.
-        Jg = []
-        h = 1e-5
-        for k in range(3):
-            step = np.zeros(3 + K)
-            step[k] = h
-            Xk, _ = transport(_apply(s, step, s.depth, K), obs)
-            Jg.append(image((Xk - X) / h))
-        Jq = image(np.cross(s.axis, X - s.point))
-    G = len(Jg)
-    J = np.stack(Jg, axis=-1)  # (N, K, 2, G)
-    P = G + K
-    H, g = np.zeros((P, P)), np.zeros(P)
-    wJ = w[..., None, None] * J
-    H[:G, :G] = np.einsum("nkig,nkih->gh", wJ, J)
-    g[:G] = np.einsum("nkig,nki->g", wJ, r)
-    # q enters twice: + in the observed frame, - in the reference frame (the derivative of the relative angle).
-    wJq = w[..., None] * Jq
-    qq = np.sum(wJq * Jq, axis=-1)  # (N, K)
-    qr = np.sum(wJq * r, axis=-1)
-    gq = np.einsum("nkig,nki->nkg", wJ, Jq)  # (N, K, G)
-    lq = np.sum(w[..., None] * Jl * Jq, axis=-1)  # (N, K)
-    own = np.zeros((N, K))
-    own[np.arange(N), obs.ref] = 1.0
-    H[G:, G:] = np.diag(qq.sum(0)) - qq.T @ own - own.T @ qq + own.T @ (qq.sum(1)[:, None] * own)
-    H[:G, G:] = gq.sum(0).T - gq.sum(1).T @ own
-    H[G:, :G] = H[:G, G:].T
-    g[G:] = qr.sum(0) - own.T @ qr.sum(1)
-    Hll = np.einsum("nk,nki,nki->n", w, Jl, Jl)
-    gl = np.einsum("nk,nki,nki->n", w, Jl, r)
-    Hgl = np.zeros((P, N))
-    Hgl[:G] = np.einsum("nkig,nki->gn", wJ, Jl)
-    Hgl[G:] = lq.T - (own * lq.sum(1)[:, None]).T
-    return H, g, Hll, Hgl, gl
+        steps = [_apply(s, np.concatenate([h * one, np.zeros(K)]), s.depth, K) for one in np.eye(3)]
+        moved, still = np.array([x.axis for x in steps]), np.array([x.point for x in steps])
+    G = len(moved)
+    H, g, Hll, gl, Hgl = np.zeros((G + K, G + K)), np.zeros(G + K), np.zeros(N), np.zeros(N), np.zeros((G + K, N))
+    slip = np.zeros((0, 0, 2)) if obs.slip is None else obs.slip
+    _sum(np.asarray(X), np.ascontiguousarray(D), r, w, slip, obs.ref_rays, s.depth, s.q, obs.ref, s.axis, s.point,
+         np.ascontiguousarray(moved), still, s.kind == "prismatic", h, 1 / obs.px, H, g, Hll, gl, Hgl)  # fmt: skip
+    return np.triu(H) + np.triu(H, 1).T, g, Hll, Hgl, gl
+
+
+@njit(cache=True, nogil=True)
+def _sum(X: np.ndarray, D: np.ndarray, r: np.ndarray, w: np.ndarray, slip: np.ndarray, rays: np.ndarray,
+         depth: np.ndarray, q: np.ndarray, ref: np.ndarray, axis: np.ndarray, point: np.ndarray, moved: np.ndarray,
+         still: np.ndarray, slides: bool, h: float, f: float, H: np.ndarray, g: np.ndarray, Hll: np.ndarray,
+         gl: np.ndarray, Hgl: np.ndarray) -> None:  # fmt: skip
+    """Into H's upper half, g, Hll, gl and Hgl.
+
+    Args:
+        moved, still: (G, 3) axes and points a step h of the joint's parameters away; of a slide, its axis' tangents.
+    """
+    G = len(moved)
+    J, Jq, Jl, d = np.zeros((2, G)), np.zeros(2), np.zeros(2), np.zeros(3)
+    for n in range(X.shape[0]):
+        own = ref[n]
+        for k in range(X.shape[1]):
+            wt = w[n, k]
+            if wt == 0.0:
+                continue
+            z = max(X[n, k, 2], 1e-3)
+            x0, x1 = X[n, k, 0] / z, X[n, k, 1] / z
+            u0, u1 = 0.0, 0.0
+            if slip.shape[0] > 0:
+                u0, u1 = slip[n, k, 0], slip[n, k, 1]
+            dq = q[k] - q[own]
+            cos, sin = np.cos(dq), np.sin(dq)
+            for j in range(G + 2):
+                if j == G + 1:
+                    for i in range(3):
+                        d[i] = D[n, k, i]
+                elif slides:
+                    for i in range(3):
+                        d[i] = axis[i] if j == G else dq * moved[j, i]
+                elif j == G:
+                    y0, y1, y2 = X[n, k, 0] - point[0], X[n, k, 1] - point[1], X[n, k, 2] - point[2]
+                    d[0] = axis[1] * y2 - axis[2] * y1
+                    d[1] = axis[2] * y0 - axis[0] * y2
+                    d[2] = axis[0] * y1 - axis[1] * y0
+                else:
+                    v = _turned(rays[n, 0], rays[n, 1], rays[n, 2], moved[j], cos, sin)
+                    p = _turned(still[j, 0], still[j, 1], still[j, 2], moved[j], cos, sin)
+                    for i in range(3):
+                        d[i] = (depth[n] * v[i] + still[j, i] - p[i] - X[n, k, i]) / h
+                e0, e1 = (d[0] - x0 * d[2]) / z * f, (d[1] - x1 * d[2]) / z * f
+                along = u0 * e0 + u1 * e1
+                e0 -= u0 * along
+                e1 -= u1 * along
+                if j < G:
+                    J[0, j], J[1, j] = e0, e1
+                elif j == G:
+                    Jq[0], Jq[1] = e0, e1
+                else:
+                    Jl[0], Jl[1] = e0, e1
+            e0, e1 = wt * r[n, k, 0], wt * r[n, k, 1]
+            # q enters twice: + in the observed frame, - in the reference frame (of the relative angle).
+            for j in range(G):
+                s0, s1 = wt * J[0, j], wt * J[1, j]
+                g[j] += J[0, j] * e0 + J[1, j] * e1
+                for m in range(j, G):
+                    H[j, m] += s0 * J[0, m] + s1 * J[1, m]
+                both = s0 * Jq[0] + s1 * Jq[1]
+                H[j, G + k] += both
+                H[j, G + own] -= both
+                Hgl[j, n] += s0 * Jl[0] + s1 * Jl[1]
+            qq, qr = wt * (Jq[0] * Jq[0] + Jq[1] * Jq[1]), Jq[0] * e0 + Jq[1] * e1
+            lq = wt * (Jl[0] * Jq[0] + Jl[1] * Jq[1])
+            if k != own:
+                H[G + k, G + k] += qq
+                H[G + own, G + own] += qq
+                H[G + min(k, own), G + max(k, own)] -= qq
+                g[G + k] += qr
+                g[G + own] -= qr
+                Hgl[G + k, n] += lq
+                Hgl[G + own, n] -= lq
+            Hll[n] += wt * (Jl[0] * Jl[0] + Jl[1] * Jl[1])
+            gl[n] += Jl[0] * e0 + Jl[1] * e1
