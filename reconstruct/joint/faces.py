@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.joint.finish import Finished
-from reconstruct.joint.photometric import LEAST_INVERSE, Adjustment, Pictures, Reader, Surface, spread_of
+from reconstruct.joint.photometric import LEAST_INVERSE, STEPS, Adjustment, Pictures, Reader, Surface, spread_of
 from reconstruct.joint.polish import Bundle, Sightings, link_noise, place_points, positions, residuals
 from reconstruct.joint.uncertainty import compact
 
@@ -42,7 +42,10 @@ LEAST_PIXELS, LEAST_OF_PLANE = 3000, 300
 """Pixels below which faces are not registered (of bars some pixels wide a fifth is not theirs), and of one plane."""
 MOST_PIXELS, MOST_SAMPLES, MOST_FRAMES = 8000, 500_000, 80
 """Pixels that are registered, times frames, and frames; further frames' states follow from those."""
-ROUNDS = 3
+MOST_ASKED = 48
+"""Frames, evenly over the states, that say which pixels go along."""
+ROUNDS, ROUGHLY = 3, 8
+"""How often the pixels are asked, and steps after which the first answers are good enough to ask again."""
 LOOSE = 10.0
 """Standard deviations of the tracks' states that hold a state whose frame shows nothing of the faces."""
 AWAY, AWAY_PX = 1.5, 0.15
@@ -75,7 +78,7 @@ def by_faces(done: Finished, pictures: Pictures, seed: int = 0) -> Finished:
     held = LOOSE * np.maximum(done.spread.q[frames] * radius, 0.02 * np.ptp(b.q))
     rng = np.random.default_rng(seed)
     s = Surface(b.kind, b.twist, some.q, b.log_focal, planes, frame)
-    for _ in range(ROUNDS):
+    for k in range(ROUNDS):
         face = belonging(s, reader, grid, inside)
         count = np.bincount(face[face >= 0], minlength=len(s.planes))
         face[np.isin(face, np.flatnonzero(count < LEAST_OF_PLANE))] = -1
@@ -88,7 +91,7 @@ def by_faces(done: Finished, pictures: Pictures, seed: int = 0) -> Finished:
         pick = np.sort(rng.permutation(len(px))[: min(MOST_PIXELS, MOST_SAMPLES // len(frames))])
         share = len(pick) / len(px)
         adjustment = Adjustment(reader, px[pick], face[face >= 0][pick], share, sight.focal_std, held)
-        s, _ = adjustment.solve(s)
+        s, _ = adjustment.solve(s, STEPS if k == ROUNDS - 1 else ROUGHLY)
     sure = spread_of(adjustment, s)
     turned = abs(float(s.twist.axis @ b.twist.axis))
     apart = float(np.degrees(np.arccos(min(turned, 1.0)))) / 1.96
@@ -222,6 +225,16 @@ def _windows(v: np.ndarray) -> np.ndarray:
     return np.stack([cv2.boxFilter(x, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE) for x in v])
 
 
+def _fewer(s: Surface, reader: Reader) -> tuple[Surface, Reader]:
+    """The same in MOST_ASKED frames at most, the template's among them."""
+    if len(s.q) <= MOST_ASKED:
+        return s, reader
+    order = np.argsort(s.q, kind="stable")
+    some = order[np.linspace(0, len(order) - 1, MOST_ASKED).round().astype(int)]
+    some = np.unique(np.append(some, s.frame))
+    return replace(s, q=s.q[some], frame=int(np.searchsorted(some, s.frame))), reader.of(some)
+
+
 def _misses(value: np.ndarray, near: np.ndarray) -> np.ndarray:
     """(T, h, w) mean squared differences of the windows around pixels from what the frames ``near`` show, brightness
     aside; NaN where not all of a window is seen."""
@@ -246,6 +259,7 @@ def belonging(s: Surface, reader: Reader, xy: np.ndarray, inside: np.ndarray) ->
     import cv2
 
     h, w = inside.shape
+    s, reader = _fewer(s, reader)
     flat, T = xy.reshape(-1, 2).astype(float), len(s.q)
     rest = (flat + reader.centre).astype(np.float32)
     every = np.broadcast_to(rest, (T, *rest.shape))

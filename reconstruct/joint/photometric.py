@@ -9,6 +9,7 @@ odometry" (PAMI 2018), with one joint in place of free cameras and planes in pla
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,6 +129,12 @@ class Reader:
         self.images = np.stack([cv2.GaussianBlur(pictures.grey[t].astype(np.float32), (0, 0), BLUR) for t in frames])
         self.covered = pictures.covered[frames]
         self.centre, self.focal = pictures.centre, focal
+
+    def of(self, frames: np.ndarray) -> Reader:
+        """Of some of the frames."""
+        some = copy(self)
+        some.images, some.covered = self.images[frames], self.covered[frames]
+        return some
 
     def places(self, s: Surface, xy: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """(T, N, 2) px at which points are seen that are seen at xy (N, 2), px from the centre, in the surface's frame.
