@@ -27,6 +27,7 @@ from reconstruct.joint.polish import (
     robust_loss,
     track_costs,
 )
+from reconstruct.joint.states import held_only
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import (
     Spread,
@@ -101,6 +102,7 @@ class Finished:
     view: View
     rival: Rival | None = None
     once: Bundle | None = None
+    lost: int = 0
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     best = {kind: replace(b, X=b.X[keep]) for kind, b in best.items()}
     if still is None:
         best = {kind: polish(b, sight) for kind, b in best.items()}
+        best, sight = held_only(best, sight) if view.R is None else (best, sight)
     else:
         best, sight = _together(_across_kinds(best, sight), sight, paths, still, view)
     sight = _errors(best, sight, view.restless)
@@ -245,10 +248,13 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
     sight = view.sightings(paths[members], some, lasting=100.0)
     bound = _spread_out(len(members), MOST_TRACKS)
-    few = sight.of(bound)
+    few, lost = sight.of(bound), np.zeros(0, int)
     best = {k: place_points(replace(b, X=X[bound]), few) for k, b in best.items()}
     if still is None:
         best = {k: polish(b, few, iterations=30) for k, b in best.items()}
+        shown = few.seen.any(0)
+        best, few = held_only(best, few) if view.R is None else (best, few)
+        lost = some[shown & ~few.seen.any(0)]
     else:
         apart = ~np.isin(still.ids, members)
         rest = replace(still, ids=still.ids[apart], X=still.X[apart])
@@ -264,6 +270,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     sight = replace(sight, weight=np.interp(np.arange(len(members)), bound, weight), lasting=few.lasting)
     sight.seen[bound] = few.seen[: len(bound)]
     every = replace(view.sightings(paths[members], np.arange(T), few.lasting), weight=sight.weight)
+    sight.seen[:, np.isin(some, lost)], every.seen[:, lost] = False, False
 
     def whole(b: Bundle) -> Bundle:
         """With the points of all tracks, and states in all frames."""
@@ -274,7 +281,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     if len(some) < T:
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
     first = None if once is last else whole(once)
-    return Finished(whole(last), every, members, sure, probability, view, rival, first)
+    return Finished(whole(last), every, members, sure, probability, view, rival, first, len(lost))
 
 
 def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | None, s: Sightings

@@ -31,6 +31,7 @@ from reconstruct.joint.select import (
     distinct,
     explained,
     global_profile,
+    image_speed,
     key_frames,
     motion_stretches,
     observations,
@@ -70,6 +71,11 @@ and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0
 TRIES = 3
 """Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
 nothing better than that."""
+PARTS = (slice(0, 7), slice(3, 10))
+"""Tenths of the motion that are asked alone where all of it follows no joint, of trackers that do not measure how well
+the picture holds a point: these lose a door that is seen on edge, and go on saying where it is."""
+PART_TURN_DEG = 30.0
+"""Turn from which a hinge is believed of a part of the motion: over a short way every motion turns about something."""
 LUCKIER = 1.1
 """What a later draw, or another stretch of the video, has to explain more than those before it."""
 
@@ -128,6 +134,8 @@ def fit_joint(
     assert answer is not None
     if answer.verdict == "refused" and answer.inliers < MIN_INLIERS and video.warp is None:
         answer = _slight(video, paths - camera.centre, camera, view, known) or answer
+    elif answer.verdict == "refused" and tracks.slip is None:
+        answer = _of_a_part(video, paths, camera, view, known, rng, pictures) or answer
     tell(1.0)
     if all_moves and answer.verdict == "ok":
         return replace(answer, verdict="ambiguous", reason=f"{ALONE}; {answer.reason}")
@@ -144,6 +152,21 @@ def _dominant(tries: Sequence[_Consensus]) -> _Consensus:
         if other.explained > LUCKIER * found.explained:
             found = other
     return found
+
+
+def _of_a_part(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
+               pictures: Pictures | None) -> JointFit | None:  # fmt: skip
+    """The hinge that a part of the motion follows, of which the rest knows nothing, or None; arguments of _one_draw."""
+    moving = _moving(paths, camera.diagonal)
+    path = np.cumsum(image_speed(paths.uv[moving]))
+    cuts = np.concatenate([[0], np.searchsorted(path, path[-1] * np.arange(1, 10) / 10) + 1, [len(video)]])
+    for part in PARTS:
+        span = slice(int(cuts[part.start]), int(cuts[part.stop]))
+        fit, _ = _one_draw(video, _only(paths, span), camera, view, known, rng, pictures, lambda _: None)
+        if fit.verdict == "ok" and fit.type == "revolute" and np.ptp(fit.q) > np.radians(PART_TURN_DEG):
+            words = f"frames {span.start} to {span.stop - 1} of {len(video)} follow it, and all together no joint"
+            return replace(fit, reason=f"{fit.reason}; {words}")
+    return None
 
 
 def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None) -> JointFit | None:

@@ -15,11 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from reconstruct.joint.normal import Normal, normal_equations
 from reconstruct.joint.paths import held
-from reconstruct.joint.twist import Twist, skew
+from reconstruct.joint.twist import Twist
 
 BEND = 0.1
 """Standard deviation of q's second difference over its range: weak, it decides only where few tracks are seen."""
+WALK = 0.2
+"""And of its first difference beside frames that nothing observes: what is out of sight comes to rest."""
 ROBUST_SIGMAS = 4.0
 """Scale of the loss in standard deviations of the noise: 97 % efficient for Gaussian noise."""
 HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.5
@@ -28,6 +31,8 @@ The hinges of simulated furniture lie 0.34 to 0.64 link diagonals away (knobs le
 makes it look smaller."""
 REACH = 1.5
 """Link sizes from the middle up to which a point may lie anywhere."""
+HOLDERS = 3
+"""Tracks that a frame must show near where the joint has them for its state to be part of the stroke."""
 GAUGE = 0.4
 """Logarithm of the link's depth beyond which it is brought back to 1."""
 
@@ -75,11 +80,13 @@ class Sightings:
 
     @property
     def bend(self) -> np.ndarray:
-        """(T, T) sum of squared second differences of q: what fills frames that nothing observes."""
+        """(T, T) sum of squared second differences of q, and of first ones beside frames that nothing observes."""
         T = self.seen.shape[1]
         f = np.arange(T) if self.frames is None else self.frames
-        D = second_difference(f / max(float(np.mean(np.diff(f))), 1e-9))
-        return D.T @ D
+        f, blind = f / max(float(np.mean(np.diff(f))), 1e-9), ~self.seen.any(0)
+        D, E = second_difference(f), np.diff(np.eye(T), axis=0) / np.sqrt(np.diff(f))[:, None]
+        E = E[blind[1:] | blind[:-1]]
+        return D.T @ D + (BEND / WALK) ** 2 * E.T @ E
 
 
 @dataclass(frozen=True)
@@ -163,122 +170,6 @@ def track_costs(r: np.ndarray, s: Sightings, scale: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Gauss-Newton blocks: dense (twist, focal, q, and six numbers of each free camera), points, coupling.
-
-    Attributes:
-        H: (P, P).  g: (P,).  Hp: (N, 3, 3).  gp: (N, 3).  C: (P, N, 3).  Z: (6, G) tangent basis of the twist.
-        scores: (N, P) each track's part of g.
-        lead: number of unknowns before q.
-    """
-
-    H: np.ndarray
-    g: np.ndarray
-    Hp: np.ndarray
-    gp: np.ndarray
-    C: np.ndarray
-    Z: np.ndarray
-    scores: np.ndarray
-    lead: int
-
-    def held(self, S: np.ndarray, right: np.ndarray, T: int) -> tuple[np.ndarray, np.ndarray]:
-        """The reduced system with q[0] and the first camera held still."""
-        S, right = S.copy(), right.copy()
-        fixed = [self.lead, *range(self.lead + T, min(self.lead + T + 6, len(S)))]
-        S[fixed], S[:, fixed], right[fixed] = 0.0, 0.0, 0.0
-        S[fixed, fixed] = np.trace(S) / len(S)
-        return S, right
-
-    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Schur complement, its right side, and the points' inverse blocks."""
-        diagonal = np.einsum("nii->ni", self.Hp)
-        floor = 1e-9 * diagonal.sum(1, keepdims=True) + 1e-12
-        inv = np.linalg.inv(self.Hp + (damping * diagonal + floor)[..., None] * np.eye(3))
-        # inv = L L', so that the product is one of a matrix with itself, which costs half.
-        L = np.linalg.cholesky(0.5 * (inv + inv.swapaxes(1, 2)))
-        M = (self.C.swapaxes(0, 1) @ L).swapaxes(0, 1).reshape(len(self.C), -1)
-        return self.H - M @ M.T, self.g - M @ np.einsum("nij,ni->nj", L, self.gp).ravel(), inv
-
-
-def normal_equations(
-    b: Bundle, s: Sightings, world: np.ndarray, cam: np.ndarray, r: np.ndarray, w: np.ndarray
-) -> Normal:
-    """Blocks of the weighted problem; parameters are (twist tangent, log focal, q_1 .. q_T, cameras)."""
-    N, T = s.seen.shape
-    f = s.focal * np.exp(b.log_focal)
-    z = np.maximum(cam[..., 2], 1e-3)
-    # Rows of the projection's derivative, (N, T, 2, 3), turned into the world frame.
-    P = np.zeros((N, T, 2, 3))
-    P[..., 0, 0] = P[..., 1, 1] = f / z
-    P[..., 0, 2], P[..., 1, 2] = -f * cam[..., 0] / z**2, -f * cam[..., 1] / z**2
-    P = in_camera = held(P, s.slip)
-    camera = s.R if b.R is None else b.R
-    if camera is not None:
-        P = P @ camera
-    tw = b.twist
-    R, p = tw.pose(b.q)
-    Jx = P @ R
-    if s.link is not None:
-        Jx[~s.link] = P[~s.link]
-    Z = tw.tangent(b.kind)
-
-    by_d = tw.displacement_by_direction(b.q) @ Z[:3]  # (T, 3, G)
-    by_w = tw.displacement_by_curvature(b.q) @ Z[3:]
-    turn = b.q[:, None, None] * (tw.left_jacobian(b.q) @ Z[3:])  # rotation vector's change, (T, 3, G)
-    y = world - p - tw.anchor
-    dX = by_d + by_w + np.cross(turn.swapaxes(-1, -2)[None], y[:, :, None]).swapaxes(-1, -2)  # (N, T, 3, G)
-    Jg = P @ dX
-    if s.link is not None:
-        Jg[~s.link] = 0.0
-    if s.focal_std > 0:
-        Jf = held(f * cam[..., :2] / z[..., None], s.slip)[..., None]
-        Jg = np.concatenate([Jg, Jf], axis=-1)
-    Jq = (P @ (np.cross(tw.curvature, world - tw.anchor) + tw.direction)[..., None])[..., 0]
-    if s.link is not None:
-        Jq[~s.link] = 0.0
-    A = Jg.shape[-1]
-    wr = w[..., None] * r
-    wJg = w[..., None, None] * Jg
-    H, g = np.zeros((A + T, A + T)), np.zeros(A + T)
-    flat = lambda J: J.reshape(-1, J.shape[-1])  # noqa: E731
-    H[:A, :A] = flat(wJg).T @ flat(Jg)
-    g[:A] = flat(wJg).T @ r.reshape(-1)
-    wJq = w[..., None] * Jq
-    H[np.arange(A, A + T), np.arange(A, A + T)] = np.sum(wJq * Jq, axis=(0, 2))
-    g[A:] = np.sum(wJq * r, axis=(0, 2))
-    H[:A, A:] = np.sum(Jg * wJq[..., None], axis=(0, 2)).T
-    H[A:, :A] = H[:A, A:].T
-    wJx = w[..., None, None] * Jx
-    Jx2 = Jx.reshape(N, 2 * T, 3)
-    Hp = wJx.reshape(N, 2 * T, 3).swapaxes(1, 2) @ Jx2
-    gp = (Jx2.swapaxes(1, 2) @ wr.reshape(N, 2 * T, 1))[..., 0]
-    C = np.empty((A + T, N, 3))
-    C[:A] = (wJg.reshape(N, 2 * T, A).swapaxes(1, 2) @ Jx2).swapaxes(0, 1)
-    C[A:] = np.sum(wJq[..., None] * Jx, axis=2).swapaxes(0, 1)
-    by_lead = (wJg.reshape(N, 2 * T, A).swapaxes(1, 2) @ r.reshape(N, 2 * T, 1))[..., 0]
-    scores = np.concatenate([by_lead, np.sum(wJq * r, axis=-1)], axis=1)
-    if not s.free:
-        return Normal(H, g, Hp, gp, C, Z, scores, A)
-    Jc = np.concatenate([in_camera @ -skew(cam - b.t), in_camera], axis=-1)  # (N, T, 2, 6)
-    wJc = w[..., None, None] * Jc
-    size = A + T + 6 * T
-    full, right = np.zeros((size, size)), np.zeros(size)
-    full[: A + T, : A + T], right[: A + T] = H, g
-    turned = lambda J: J.swapaxes(0, 1).reshape(T, 2 * N, -1)  # noqa: E731
-    left = turned(wJc).swapaxes(1, 2)
-    by_twist, by_q, own = left @ turned(Jg), (left @ turned(Jq))[..., 0], left @ turned(Jc)
-    for k in range(T):
-        rows = slice(A + T + 6 * k, A + T + 6 * k + 6)
-        full[rows, rows] = own[k]
-        full[rows, :A], full[:A, rows] = by_twist[k], by_twist[k].T
-        full[rows, A + k], full[A + k, rows] = by_q[k], by_q[k]
-    pull = (wJc[..., 0, :] * r[..., :1] + wJc[..., 1, :] * r[..., 1:]).reshape(N, 6 * T)
-    right[A + T :] = pull.sum(0)
-    coupling = (np.swapaxes(wJc, -1, -2) @ Jx).reshape(N, 6 * T, 3).swapaxes(0, 1)
-    return Normal(full, right, Hp, gp, np.concatenate([C, coupling]), Z, np.concatenate([scores, pull], axis=1), A)
-
-
-@dataclass(frozen=True)
 class Reach:
     """How far a link's points may lie from its middle: what is farther costs the squared distance from that sphere.
 
@@ -325,6 +216,7 @@ class _Priors:
         bend: (T, T) of q's second differences.
         radius, log_turn: weight of a hinge's radius, and the logarithm of the turn that the path at hand is expected to
             be; 0 for a slide.
+        far: the frame with the longest path of those that tracks hold.
         reach: of the link's points.
     """
 
@@ -332,24 +224,34 @@ class _Priors:
     bend: np.ndarray
     radius: float
     log_turn: float
+    far: int
     reach: Reach
 
     @classmethod
-    def of(cls, b: Bundle, s: Sightings, sigma: float, hold: float = 1.0) -> _Priors:
+    def of(cls, b: Bundle, s: Sightings, sigma: float, hold: float = 1.0, w: np.ndarray | None = None) -> _Priors:
         """Small motions say little about how far away a hinge is, and strays bend that first.
 
         Its radius over the link's size is the path over the turn over the size. Path and size scale together, so that
         the turn bears the prior: it is the number that no change of scale touches.
+
+        Args:
+            b: the joint at hand.  s: observations.  sigma: their noise, px.
+            hold: how much more than it is worth the radius counts.
+            w: (N, T) weights of the robust loss; worked out when None.
         """
+        if w is None:
+            w = robust_loss(residuals(b, s), s, ROBUST_SIGMAS * max(sigma, 0.05))[1]
         focal = sigma**2 * s.lasting / s.focal_std**2 if s.focal_std > 0 else 0.0
-        bend = s.bend * (sigma / (BEND * max(np.ptp(b.q), 1e-9))) ** 2
-        far = float(np.max(np.abs(b.q)))
+        held = _held(s, w)
+        bend = s.bend * (sigma / (BEND * max(float(np.ptp(b.q[held])), 1e-9))) ** 2
+        far = int(held[np.argmax(np.abs(b.q[held]))])
+        path = abs(float(b.q[far]))
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
         reach = Reach.of(b, s, sigma)
-        if b.kind == "prismatic" or s.link is not None or far <= 0 or size <= 0:
-            return cls(focal, bend, 0.0, 0.0, reach)
+        if b.kind == "prismatic" or s.link is not None or path <= 0 or size <= 0:
+            return cls(focal, bend, 0.0, 0.0, far, reach)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
-        return cls(focal, bend, radius, float(np.log(far / (HINGE_RADIUS * size))), reach)
+        return cls(focal, bend, radius, float(np.log(path / (HINGE_RADIUS * size))), far, reach)
 
     def cost(self, b: Bundle) -> float:
         """Without the radius, which is weighed apart where types are compared."""
@@ -357,7 +259,11 @@ class _Priors:
 
     def radius_cost(self, b: Bundle) -> float:
         """Of the radius alone."""
-        return self.radius * (_log_turn(b) - self.log_turn) ** 2 if self.radius else 0.0
+        return self.radius * (self.turn(b) - self.log_turn) ** 2 if self.radius else 0.0
+
+    def turn(self, b: Bundle) -> float:
+        """Its logarithm."""
+        return float(np.log(max(np.linalg.norm(b.twist.curvature) * abs(b.q[self.far]), 1e-9)))
 
     def add(self, n: Normal, b: Bundle) -> None:
         """Into the normal equations."""
@@ -372,15 +278,23 @@ class _Priors:
         n.gp[...] += g
         k2 = float(b.twist.curvature @ b.twist.curvature)
         if self.radius and k2 > 0:
-            far = int(np.argmax(np.abs(b.q)))
             row = np.zeros(len(n.g))
-            row[:G], row[A + far] = n.Z[3:].T @ b.twist.curvature / k2, 1 / b.q[far]
+            row[:G], row[A + self.far] = n.Z[3:].T @ b.twist.curvature / k2, 1 / b.q[self.far]
             n.H[...] += self.radius * np.outer(row, row)
-            n.g[...] += self.radius * (_log_turn(b) - self.log_turn) * row
+            n.g[...] += self.radius * (self.turn(b) - self.log_turn) * row
 
 
-def _log_turn(b: Bundle) -> float:
-    return float(np.log(max(np.linalg.norm(b.twist.curvature) * np.max(np.abs(b.q)), 1e-9)))
+def _held(s: Sightings, w: np.ndarray) -> np.ndarray:
+    """(k,) frames whose state tracks hold, by the robust loss's weights (N, T); all of them where these are too few.
+
+    Where a tracker has lost everything a state may run off for nothing: in units of its own path it would not be bent,
+    and of a hinge that is far away it would be what makes it near.
+    """
+    near = w > 0.25 * s.weight[:, None]
+    if s.link is not None:
+        near = near[s.link]
+    held = np.flatnonzero(near.sum(0) >= HOLDERS)
+    return held if len(held) > 1 else np.arange(len(near[0]))
 
 
 def radius_cost(b: Bundle, s: Sightings) -> float:
@@ -427,7 +341,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
         damping = 1e-4
         loss, w = robust_loss(r, s, limit)
         for _ in range(iterations):
-            priors = _Priors.of(b, s, sigma, hold)
+            priors = _Priors.of(b, s, sigma, hold, w)
             cost = loss + priors.cost(b) + priors.radius_cost(b) + priors.reach.cost(b.X)
             n = normal_equations(b, s, world, cam, r, w)
             priors.add(n, b)

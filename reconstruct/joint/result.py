@@ -85,6 +85,8 @@ def result_of(
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     K = np.array([[full_focal, 0, (video.size[0] - 1) / 2], [0, full_focal, (video.size[1] - 1) / 2], [0, 0, 1.0]])
     p = max(probability.values())
+    if done.lost:
+        note = f"{note}; in {done.lost} of {len(q)} frames its tracks agree on no state"
     verdict, reason = "ok", f"{len(done.members)} tracks agree; {how}{note}"
     if p < 1 - LIKELY:
         verdict = "ambiguous"
@@ -93,12 +95,6 @@ def result_of(
             f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}{note}"
         )
     sure = done.spread
-    if verdict == "ok" and sure.axis_deg > VAGUE_DEG:
-        verdict = "ambiguous"
-        reason = (
-            f"{len(done.members)} tracks hold the axis to {sure.axis_deg:.0f} deg only; a longer motion, or more of "
-            f"the part in view, would tell; {how}{note}"
-        )
     rival, axis_deg = done.rival, sure.axis_deg
     if rival is not None:
         axis_deg = float(np.hypot(axis_deg, np.sqrt(rival.probability) * rival.apart_deg))
@@ -107,6 +103,12 @@ def result_of(
         reason = (
             f"another axis, {rival.apart_deg:.0f} deg off, explains the motion almost equally well "
             f"(p = {rival.probability:.2f}); a longer motion would tell; {how}{note}"
+        )
+    if verdict == "ok" and axis_deg > VAGUE_DEG:
+        verdict = "ambiguous"
+        reason = (
+            f"{len(done.members)} tracks hold the axis to {axis_deg:.0f} deg only; a longer motion, or more of "
+            f"the part in view, would tell; {how}{note}"
         )
     std = {"axis_deg": axis_deg, "point_m": sure.point, "q": sure.q,
            "focal_px": full_focal * (sure.log_focal if focal_std is None else focal_std)}  # fmt: skip

@@ -148,7 +148,7 @@ def test_a_search_that_is_out_of_luck_is_drawn_again(monkeypatch):
     assert fit.verdict == "ok" and axis_error_deg(fit, scene) < 1.0
     assert len(asked) == 3 and len(set(asked)) == 3
     fit = unlucky(9)
-    assert (fit.verdict, fit.reason, len(asked)) == ("refused", "draw 1", fit_module.TRIES)
+    assert (fit.verdict, fit.reason, len(asked)) == ("refused", "draw 1", fit_module.TRIES + len(fit_module.PARTS))
     fit = unlucky(1, explained=1.0)
     assert (fit.verdict, fit.reason) == ("refused", "draw 1")
 

@@ -1,0 +1,90 @@
+"""The joint's state in frames that an adjustment has lost.
+
+A robust loss has no slope far from its optimum: a state that has run off stays where it is. And where a tracker has
+lost the link, but goes on saying where it is, the state runs off with what two or three of its tracks do next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruct.joint.paths import held as along_held
+from reconstruct.joint.polish import ROBUST_SIGMAS, Bundle, Sightings, positions, residuals
+
+HOLDERS, HOLDING = 3, 0.25
+"""A state is held by so many tracks near where the joint has them, and such a share of those that are seen."""
+AROUND, STEP = 0.5, 1.5
+"""How far beyond the stroke a lost state is looked for, over the stroke, and by how many scales of the loss apart."""
+MOST_STATES, MOST_ASKED = 400, 150
+"""States that are tried at most, and tracks that are asked."""
+
+
+def held_frames(b: Bundle, s: Sightings) -> np.ndarray:
+    """(T,) bool: frames whose state tracks of the link agree on.
+
+    Args:
+        b: the joint.  s: its observations before a resting camera.
+    """
+    near = s.seen & (np.linalg.norm(residuals(b, s), axis=-1) < ROBUST_SIGMAS * max(b.sigma, 0.05))
+    return near.sum(0) >= np.maximum(HOLDERS, HOLDING * s.seen.sum(0))
+
+
+def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:
+    """Joints with lost states found again, and the sightings without the frames in which none of them is held.
+
+    What is seen there is not the link. These states, and those of frames that see nothing, are between those around.
+
+    Args:
+        best: joints of every type, of the same tracks.  s: their observations before a resting camera.
+    """
+    found = {kind: found_again(b, s) for kind, b in best.items()}
+    held = np.logical_or.reduce([held_frames(b, s) for b in found.values()])
+    if not (s.seen.any(0) & ~held).any() or held.sum() < 2:
+        return found, s
+    every = np.arange(len(held))
+    found = {kind: with_states(b, np.interp(every, every[held], b.q[held])) for kind, b in found.items()}
+    return found, replace(s, seen=s.seen & held)
+
+
+def found_again(b: Bundle, s: Sightings) -> Bundle:
+    """The joint with the states that no track holds looked for along the stroke of those that are held.
+
+    Args:
+        b: the joint.  s: its observations before a resting camera.
+    """
+    held = held_frames(b, s)
+    lost = np.flatnonzero(~held & s.seen.any(0))
+    if not len(lost) or held.sum() < 2:
+        return b
+    low, high = float(b.q[held].min()), float(b.q[held].max())
+    limit2 = (ROBUST_SIGMAS * max(b.sigma, 0.05)) ** 2
+    ids = np.unique(np.linspace(0, len(b.X) - 1, min(len(b.X), MOST_ASKED)).round().astype(int))
+    few, some = s.of(ids), replace(b, X=b.X[ids])
+
+    def seen_at(q: np.ndarray) -> np.ndarray:
+        """(n, len(q), 2) px."""
+        at = positions(replace(some, q=q), few)[1]
+        return few.focal * np.exp(b.log_focal) * at[..., :2] / np.maximum(at[..., 2:], 1e-3)
+
+    ends = seen_at(np.array([low, high]))
+    way = (1 + 2 * AROUND) * float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)))
+    count = int(np.clip(way / (STEP * np.sqrt(limit2)), 10, MOST_STATES))
+    tried = np.linspace(low - AROUND * (high - low), high + AROUND * (high - low), count)
+    at, q = seen_at(tried), b.q.copy()
+    for t in lost:
+        on = few.seen[:, t]
+        here = np.concatenate([at[on], seen_at(b.q[[t]])[on]], axis=1) - few.uv[on, None, t]
+        along = None if few.slip is None else few.slip[on, None, t]
+        r2 = np.sum(along_held(here, along) ** 2, axis=-1)
+        cost = few.weight[on] @ (r2 / (r2 + limit2))
+        if (k := int(np.argmin(cost))) < count:
+            q[t] = tried[k]
+    return with_states(b, q)
+
+
+def with_states(b: Bundle, q: np.ndarray) -> Bundle:
+    """The joint in states q (T,), of which the first becomes 0 again."""
+    R, p = (x[0] for x in b.twist.pose(q[:1]))
+    return replace(b, q=q - q[0], X=(b.X - b.twist.anchor) @ R.T + p + b.twist.anchor)

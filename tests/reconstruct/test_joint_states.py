@@ -1,0 +1,93 @@
+"""States in frames where a tracker has lost the link and goes on saying where it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reconstruct.joint.finish import View, finish
+from reconstruct.joint.paths import Paths
+from reconstruct.joint.polish import Bundle, polish, positions
+from reconstruct.joint.states import found_again, held_frames, held_only, with_states
+from tests.reconstruct.test_joint_polish import FOCAL, scene
+
+KINDS = ("revolute", "prismatic")
+
+
+def off_deg(b: Bundle, truth: Bundle) -> float:
+    return float(np.degrees(np.arccos(np.clip(abs(b.twist.axis @ truth.twist.axis), 0, 1))))
+
+
+def left_behind(uv: np.ndarray, since: int, seed: int) -> np.ndarray:
+    """All tracks let go of the link in one frame, and each wanders by itself, as far as the link went and farther."""
+    rng = np.random.default_rng(seed)
+    out = uv.copy()
+    steps = rng.normal(scale=6.0, size=out[:, since:].shape)
+    out[:, since:] = out[:, since - 1 : since] + np.cumsum(steps, axis=1)
+    return out
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_that_have_run_off_are_found_again(kind):
+    truth, s = scene(kind, 0)
+    away = truth.q.copy()
+    away[[5, 6, 7, len(away) - 1]] = [3.0, -2.0, 40.0, 1e4]
+    b = with_states(replace(truth, sigma=0.5), away)
+    assert not held_frames(b, s)[[5, 6, 7, -1]].any() and held_frames(b, s).sum() == len(away) - 4
+    found = found_again(b, s)
+    assert np.abs(found.q - truth.q).max() < 0.05 * np.ptp(truth.q)
+    assert found_again(truth, s) is truth
+
+
+def test_the_first_state_may_be_the_lost_one():
+    truth, s = scene("revolute", 0)
+    away = truth.q.copy()
+    away[0] = 9.0
+    b = with_states(replace(truth, sigma=0.5), away)
+    assert np.allclose(positions(b, s)[0][:, 1:], positions(truth, s)[0][:, 1:])
+    found = found_again(b, s)
+    assert found.q[0] == 0
+    assert np.abs(found.q - truth.q).max() < 0.05 * np.ptp(truth.q)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_that_agree_on_no_state_have_no_say(kind):
+    truth, s = scene(kind, 1)
+    T = len(truth.q)
+    since = T - 12
+    lost = replace(s, uv=left_behind(s.uv, since, 1))
+    best, kept = held_only({kind: replace(truth, sigma=0.5)}, lost)
+    assert not kept.seen[:, since + 1 :].any() and kept.seen[:, :since].all()
+    assert np.allclose(best[kind].q[since + 1 :], best[kind].q[since], atol=0.05 * np.ptp(truth.q))
+    same, all_of_it = held_only({kind: truth}, s)
+    assert all_of_it is s and same[kind] is truth
+
+
+def test_an_end_without_tracks_does_not_run_off():
+    """It did, by thousands of turns: a state that nothing holds was what made a hinge as near as hinges are."""
+    truth, s = scene("revolute", 3, points=40, frames=60, stroke=0.6)
+    since = 35
+    uv = left_behind(s.uv, since, 3)
+    uv[2:, since:], uv[:, since + 10 :] = np.nan, np.nan
+    done = finish({"revolute": [truth], "prismatic": [_slide(truth)]}, Paths(uv, None), np.arange(len(uv)), View(FOCAL))
+    assert done.bundle.kind == "revolute" and done.probability["revolute"] > 0.9
+    assert done.lost == 10
+    assert off_deg(done.bundle, truth) < 3 * max(done.spread.axis_deg, 0.3)
+    turned = done.bundle.q * np.linalg.norm(done.bundle.twist.curvature)
+    right = truth.q * np.linalg.norm(truth.twist.curvature)
+    assert np.abs(turned - right)[:since].max() < 0.05
+    assert np.ptp(turned[since:]) < 0.15
+
+
+def test_what_nothing_sees_comes_to_rest():
+    truth, s = scene("revolute", 3)
+    seen = s.seen.copy()
+    seen[:, -10:] = False
+    b = polish(truth, replace(s, seen=seen))
+    speed = np.abs(np.diff(b.q))
+    assert speed[-3:].max() < 0.1 * speed[:-12].max()
+
+
+def _slide(hinge: Bundle) -> Bundle:
+    direction = hinge.twist.direction / np.linalg.norm(hinge.twist.direction)
+    return replace(hinge, kind="prismatic", twist=replace(hinge.twist, direction=direction, curvature=np.zeros(3)))
