@@ -36,14 +36,17 @@ def mirrored(b: Bundle) -> Bundle:
     return replace(b, X=X, twist=Twist(anchor, b.twist.direction * flip, -b.twist.curvature * flip))
 
 
-def test_strays_that_stay_near_do_not_bend_a_small_motion():
-    with_strays, alone = [], []
-    for seed in range(4):
+def test_strays_that_stay_near_do_not_mislead_unsaid():
+    """They make a small motion's axis twice as wrong (docs/notes/joint.md); what is stated has to know."""
+    off, stated = [], []
+    for seed in range(6):
         truth, s = scene("revolute", seed, points=80, frames=60, stroke=0.17)
-        for uv, out in ((wandering(s.uv, 0.25, seed), with_strays), (s.uv, alone)):
-            done = finish({"revolute": [truth]}, Paths(uv, None), np.arange(len(uv)), View(FOCAL))
-            out.append(off_deg(done.bundle, truth))
-    assert np.median(with_strays) < 2 * np.median(alone)
+        uv = wandering(s.uv, 0.25, seed)
+        done = finish({"revolute": [truth]}, Paths(uv, None), np.arange(len(uv)), View(FOCAL))
+        off.append(off_deg(done.bundle, truth))
+        stated.append(done.spread.axis_deg)
+    assert np.mean(np.array(off) < 1.96 * np.array(stated)) > 0.9
+    assert np.median(off) < 2.5 and np.median(stated) < 5
 
 
 def test_a_start_that_the_first_round_prefers_wrongly_is_found_out():
