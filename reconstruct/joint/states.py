@@ -15,6 +15,9 @@ from reconstruct.joint.polish import ROBUST_SIGMAS, Bundle, Sightings, positions
 
 HOLDERS, HOLDING = 3, 0.25
 """A state is held by so many tracks near where the joint has them, and such a share of those that are seen."""
+FEW = 0.5
+"""Share of the tracks that a frame shows at best below which a frame without a state is the tracker's failure. Where
+most are seen, that they agree on no state speaks against the joint."""
 AROUND, STEP = 0.5, 1.5
 """How far beyond the stroke a lost state is looked for, over the stroke, and by how many scales of the loss apart."""
 MOST_STATES, MOST_ASKED = 400, 150
@@ -32,7 +35,8 @@ def held_frames(b: Bundle, s: Sightings) -> np.ndarray:
 
 
 def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:
-    """Joints with lost states found again, and the sightings without the frames in which none of them is held.
+    """Joints with lost states found again, and the sightings without the frames in which few tracks are seen and no
+    joint is held.
 
     What is seen there is not the link. These states, and those of frames that see nothing, are between those around.
 
@@ -40,7 +44,8 @@ def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle],
         best: joints of every type, of the same tracks.  s: their observations before a resting camera.
     """
     found = {kind: found_again(b, s) for kind, b in best.items()}
-    held = np.logical_or.reduce([held_frames(b, s) for b in found.values()])
+    count = s.seen.sum(0)
+    held = np.logical_or.reduce([held_frames(b, s) for b in found.values()]) | (count > FEW * count.max())
     if not (s.seen.any(0) & ~held).any() or held.sum() < 2:
         return found, s
     every = np.arange(len(held))

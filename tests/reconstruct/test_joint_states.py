@@ -55,10 +55,13 @@ def test_frames_that_agree_on_no_state_have_no_say(kind):
     truth, s = scene(kind, 1)
     T = len(truth.q)
     since = T - 12
-    lost = replace(s, uv=left_behind(s.uv, since, 1))
+    few = s.seen.copy()
+    few[20:, since:] = False
+    lost = replace(s, uv=left_behind(s.uv, since, 1), seen=few)
     best, kept = held_only({kind: replace(truth, sigma=0.5)}, lost)
     assert not kept.seen[:, since + 1 :].any() and kept.seen[:, :since].all()
     assert np.allclose(best[kind].q[since + 1 :], best[kind].q[since], atol=0.05 * np.ptp(truth.q))
+    assert held_only({kind: replace(truth, sigma=0.5)}, replace(lost, seen=s.seen))[1].seen.all()  # they contradict it
     same, all_of_it = held_only({kind: truth}, s)
     assert all_of_it is s and same[kind] is truth
 
