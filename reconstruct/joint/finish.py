@@ -227,7 +227,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     best = {kind: replace(b, X=b.X[keep]) for kind, b in best.items()}
     if still is None:
         best = {kind: polish(b, sight) for kind, b in best.items()}
-        best, sight = held_only(best, sight) if view.R is None else (best, sight)
+        best, sight = held_only(best, sight) if view.R is None and sight.slip is None else (best, sight)
     else:
         best, sight = _together(_across_kinds(best, sight), sight, paths, still, view)
     sight = _errors(best, sight, view.restless)
@@ -253,7 +253,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     if still is None:
         best = {k: polish(b, few, iterations=30) for k, b in best.items()}
         shown = few.seen.any(0)
-        best, few = held_only(best, few) if view.R is None else (best, few)
+        best, few = held_only(best, few) if view.R is None and few.slip is None else (best, few)
         lost = some[shown & ~few.seen.any(0)]
     else:
         apart = ~np.isin(still.ids, members)

@@ -85,7 +85,7 @@ class Sightings:
         f = np.arange(T) if self.frames is None else self.frames
         f, blind = f / max(float(np.mean(np.diff(f))), 1e-9), ~self.seen.any(0)
         D, E = second_difference(f), np.diff(np.eye(T), axis=0) / np.sqrt(np.diff(f))[:, None]
-        E = E[blind[1:] | blind[:-1]]
+        E = E[(blind[1:] | blind[:-1]) & (self.slip is None)]
         return D.T @ D + (BEND / WALK) ** 2 * E.T @ E
 
 
@@ -294,7 +294,8 @@ def _held(s: Sightings, w: np.ndarray) -> np.ndarray:
     if s.link is not None:
         near = near[s.link]
     held = np.flatnonzero(near.sum(0) >= HOLDERS)
-    return held if len(held) > 1 else np.arange(len(near[0]))
+    # Trackers that measure what the picture holds drop what they have lost.
+    return held if len(held) > 1 and s.slip is None else np.arange(len(near[0]))
 
 
 def radius_cost(b: Bundle, s: Sightings) -> float:
