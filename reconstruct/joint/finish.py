@@ -92,6 +92,7 @@ class Finished:
         rival: the most probable of the other axes that were among the starts.
         once: the bundle as one adjustment of all tracks found it, before halves of the link and the tracks without
             strays led to a better one; that where None. A free body is fitted once as well, and is held against this.
+        lost: number of frames that show tracks of the link, of which too few agree on a state; 0 for tracks with slip.
     """
 
     bundle: Bundle

@@ -1,7 +1,8 @@
 """The joint's state in frames that an adjustment has lost.
 
 A robust loss has no slope far from its optimum: a state that has run off stays where it is. And where a tracker has
-lost the link, but goes on saying where it is, the state runs off with what two or three of its tracks do next.
+lost the link, but goes on saying where it is, the state runs off with what two or three of its tracks do next. Asked of
+tracks without slip: those that measure what the picture holds are dropped where it is lost.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.joint.paths import held as along_held
-from reconstruct.joint.polish import ROBUST_SIGMAS, Bundle, Sightings, positions, residuals
+from reconstruct.joint.polish import HOLDERS, ROBUST_SIGMAS, Bundle, Sightings, positions, residuals
 
-HOLDERS, HOLDING = 3, 0.25
-"""A state is held by so many tracks near where the joint has them, and such a share of those that are seen."""
+HOLDING = 0.25
+"""A state is held by HOLDERS tracks near where the joint has them, and such a share of those that are seen."""
 FEW = 0.5
 """Share of the tracks that a frame shows at best below which a frame without a state is the tracker's failure. Where
 most are seen, that they agree on no state speaks against the joint."""
@@ -90,6 +91,7 @@ def found_again(b: Bundle, s: Sightings) -> Bundle:
 
 
 def with_states(b: Bundle, q: np.ndarray) -> Bundle:
-    """The joint in states q (T,), of which the first becomes 0 again."""
+    """The same motion in states q (T,), path lengths as in :class:`Bundle`: the points are those of the first, which
+    becomes 0 again."""
     R, p = (x[0] for x in b.twist.pose(q[:1]))
     return replace(b, q=q - q[0], X=(b.X - b.twist.anchor) @ R.T + p + b.twist.anchor)
