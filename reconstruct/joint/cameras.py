@@ -64,11 +64,16 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:
     """A hinge and a slide between two camera paths: starts for the bundle adjustment, in the static body's frame.
 
     With X = ratio * X_link in the first camera's frame, the link moves by D_t = R_t' A_t and
-    d_t = R_t' (ratio a_t - t_t). A hinge has d_t = (I - D_t) c: linear in c and the ratio.
+    d_t = R_t' (ratio a_t - t_t). A hinge has d_t = (I - D_t) c: linear in c and the ratio. Frames that do not show both
+    bodies have no say; their states are between those around.
     """
-    D = np.swapaxes(static.R, 1, 2) @ link.R
-    p = np.einsum("tji,tj->ti", static.R, link.t)
-    s = np.einsum("tji,tj->ti", static.R, static.t)
+    both = np.flatnonzero(static.shown & link.shown)
+    if len(both) < 3:
+        return {}
+    every, R = np.arange(len(static.R)), static.R[both]
+    D = np.swapaxes(R, 1, 2) @ link.R[both]
+    p = np.einsum("tji,tj->ti", R, link.t[both])
+    s = np.einsum("tji,tj->ti", R, static.t[both])
     out: dict[str, Bundle] = {}
     turns = Rotation.from_matrix(D).as_rotvec()
     points = link.X[link.members]
@@ -90,7 +95,7 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:
         point = v[:3] - axis * ((v[:3] - middle) @ axis)
         if np.linalg.norm(middle - point) > 1e-6:
             twist, speed = twist_of_joint("revolute", axis, point, middle)
-            q = np.unwrap(turns @ axis)
+            q = np.interp(every, both, np.unwrap(turns @ axis))
             out["revolute"] = Bundle("revolute", twist, (q - q[0]) * speed, v[3] * points)
     best = (np.inf, 1.0)
     for ratio in np.exp(np.linspace(np.log(0.3), np.log(3.0), 200)):
@@ -103,6 +108,7 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:
     q = d @ along
     if abs(q.min()) > q.max():
         along, q = -along, -q
+    q = np.interp(every, both, q)
     middle = best[1] * np.median(points, axis=0)
     out["prismatic"] = Bundle("prismatic", Twist(middle, along, np.zeros(3)), q - q[0], best[1] * points)
     return out

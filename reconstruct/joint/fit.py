@@ -52,9 +52,10 @@ DEPTHS = 0.68
 """What the compensation of a moving camera leaves depends on the depth, and the link's own is not known: it is taken to
 be what this share of the resting points stays under, one standard deviation."""
 STROKE_STDS = 8.0
-"""Stroke over a state's standard deviation up to which two groups of tracks before a moving camera are one body."""
+"""Stroke over its standard deviation up to which two groups of tracks before a moving camera are one body."""
 NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
 NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
+APART = "the camera moves, and hardly any frame shows the scene and the part together"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 ALONE = "all that is followed moves as one body: the camera may go round it as well as the part may turn"
 DEFAULT_FOCAL = 0.8
@@ -406,8 +407,8 @@ def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, se
     """
     asked = np.ones(len(paths), bool)
     while (bodies := two_bodies(paths.uv, view.focal, seed, asked)) is not None:
-        fit = _between(*bodies, video, paths, view, full_focal)
-        if fit.verdict == "refused" or np.ptp(fit.q) > STROKE_STDS * np.median(fit.std["q"]):
+        fit, stroke = _between(*bodies, video, paths, view, full_focal)
+        if fit.verdict == "refused" or stroke > STROKE_STDS:
             return fit
         asked &= ~min(bodies, key=lambda body: body.members.sum()).members
     if asked.all():
@@ -415,15 +416,20 @@ def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, se
     return JointFit("refused", NO_STROKE, tracks=len(paths))
 
 
-def _between(static: Rigid, link: Rigid, video: Video, paths: Paths, view: View, full_focal: float) -> JointFit:
+def _between(static: Rigid, link: Rigid, video: Video, paths: Paths, view: View, full_focal: float
+             ) -> tuple[JointFit, float]:  # fmt: skip
+    """The joint between two bodies, and its stroke over that one's standard deviation; arguments of _moving_camera."""
     starts = joints_between(static, link)
+    if not starts:
+        return JointFit("refused", APART, tracks=len(paths), inliers=int(link.members.sum())), 0.0
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])
     try:
         done = finish({k: [b] for k, b in starts.items()}, paths, np.flatnonzero(link.members), view, still)
     except NoLink:
-        return JointFit("refused", NO_LINK, tracks=len(paths), inliers=int(link.members.sum()))
+        return JointFit("refused", NO_LINK, tracks=len(paths), inliers=int(link.members.sum())), 0.0
     if reason := why_not_believed(done):
-        return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members))
+        return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members)), 0.0
     note = "; the camera moves: its path is fitted together with the joint"
-    return result_of(video, done, full_focal, len(paths), note, KNOWN_STD if view.focal_std == 0 else None)
+    fit = result_of(video, done, full_focal, len(paths), note, KNOWN_STD if view.focal_std == 0 else None)
+    return fit, done.spread.stroke

@@ -27,6 +27,8 @@ PATCH = (14, 30)
 TILTS_DEG = (25.0, 45.0, 60.0, 70.0, 78.0)
 GROWN = 6
 """Neighbourhoods that are grown to bodies."""
+HOLDERS = 6
+"""Tracks that a frame must show for a body's pose to be held there: twice what a pose needs."""
 FINISHED = 3
 """Bodies that are looked at in all frames."""
 SLOW, SLOW_WINDOWS = 4.0, 5
@@ -43,6 +45,7 @@ class Rigid:
         X: (N, 3) points of all tracks (meaningful for members).
         members: (N,) bool.  sigma: noise of one coordinate, px.
         cost: (N,) mean loss of each track's observations under this motion, in [0, 1]; 1 where it is not seen.
+        shown: (T,) bool, frames that show enough of the body to hold its pose; between them it is interpolated.
     """
 
     R: np.ndarray
@@ -51,11 +54,14 @@ class Rigid:
     members: np.ndarray
     sigma: float
     cost: np.ndarray
+    shown: np.ndarray
 
 
 def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | None = None
                ) -> tuple[Rigid, Rigid] | None:  # fmt: skip
     """The two largest rigid groups, every track with the one that it fits better; None if there are none.
+
+    The first is the one that is in sight for longer, of two in sight alike the larger one.
 
     Args:
         uv: (N, T, 2) px from the principal point, NaN where not seen.  focal: px.
@@ -75,6 +81,9 @@ def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | 
         if min((one.members & mine).sum(), (other.members & theirs).sum()) < MIN_GROUP:
             break
         one, other = regrown(uv, focal, one, mine), regrown(uv, focal, other, theirs)
+    if one.shown.sum() < other.shown.sum():
+        # Of a scene the camera's path is asked in every frame, a link may be out of sight for a while.
+        return other, one
     return one, other
 
 
@@ -363,7 +372,19 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     if unit <= 0:
         return None
     cost = _track_cost(x, seen, R, t, X, focal, 4 * max(sigma, 0.25))
-    return Rigid(R, t / unit, X / unit, members, sigma, cost)
+    shown = seen[members].sum(0) >= HOLDERS
+    if shown.sum() < 2:
+        return None
+    R, t = between(R, t, shown)
+    return Rigid(R, t / unit, X / unit, members, sigma, cost, shown)
+
+
+def between(R: np.ndarray, t: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T, 3, 3), (T, 3) with those of frames that are not shown (T,) between the ones around them."""
+    known, every = np.flatnonzero(shown), np.arange(len(R))
+    inside = np.clip(every, known[0], known[-1])
+    R = Slerp(known, Rotation.from_matrix(R[known]))(inside).as_matrix()
+    return R, np.stack([np.interp(every, known, t[known, k]) for k in range(3)], axis=1)
 
 
 def adjust(x, seen, R, t, X, focal, iterations: int = 8, slip=None):

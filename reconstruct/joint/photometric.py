@@ -412,5 +412,8 @@ def spread_of(a: Adjustment, s: Surface) -> Spread:
     focal = float(np.sqrt(variance(np.eye(len(g))[G : G + 1])[0])) if a.focal_std > 0 else 0.0
     q = np.sqrt(variance(rows[2]))
     q[0] = 0.0
+    low, high = int(np.argmin(base[2])), int(np.argmax(base[2]))
+    ends = np.sqrt(variance(rows[2][high : high + 1] - rows[2][low : low + 1])[0])
+    stroke = float((base[2][high] - base[2][low]) / max(ends, 1e-12))
     return Spread(float(np.degrees(np.sqrt(axis.sum()))), float(np.sqrt(variance(rows[1]).sum())), q, curvature, focal,
-                  float(axis.sum() / max(plain, 1e-30)))  # fmt: skip
+                  float(axis.sum() / max(plain, 1e-30)), stroke)  # fmt: skip

@@ -80,10 +80,12 @@ class Sightings:
 
     @property
     def bend(self) -> np.ndarray:
-        """(T, T) sum of squared second differences of q, and of first ones beside frames that nothing observes."""
+        """(T, T) sum of squared second differences of q, and of first ones beside frames that do not show the link, or
+        the scene that a moving camera's path is known by."""
         T = self.seen.shape[1]
         f = np.arange(T) if self.frames is None else self.frames
-        f, blind = f / max(float(np.mean(np.diff(f))), 1e-9), ~self.seen.any(0)
+        shown = [self.seen] if self.link is None else [self.seen[self.link], self.seen[~self.link]]
+        f, blind = f / max(float(np.mean(np.diff(f))), 1e-9), ~np.all([x.any(0) for x in shown], axis=0)
         D, E = second_difference(f), np.diff(np.eye(T), axis=0) / np.sqrt(np.diff(f))[:, None]
         E = E[(blind[1:] | blind[:-1]) & (self.slip is None)]
         return D.T @ D + (BEND / WALK) ** 2 * E.T @ E
@@ -242,7 +244,7 @@ class _Priors:
         if w is None:
             w = robust_loss(residuals(b, s), s, ROBUST_SIGMAS * max(sigma, 0.05))[1]
         focal = sigma**2 * s.lasting / s.focal_std**2 if s.focal_std > 0 else 0.0
-        held = _held(s, w)
+        held = frames_held(s, w)
         bend = s.bend * (sigma / (BEND * max(float(np.ptp(b.q[held])), 1e-9))) ** 2
         far = int(held[np.argmax(np.abs(b.q[held]))])
         path = abs(float(b.q[far]))
@@ -284,7 +286,7 @@ class _Priors:
             n.g[...] += self.radius * (self.turn(b) - self.log_turn) * row
 
 
-def _held(s: Sightings, w: np.ndarray) -> np.ndarray:
+def frames_held(s: Sightings, w: np.ndarray) -> np.ndarray:
     """(k,) frames whose state tracks hold, by the robust loss's weights (N, T); all of them where these are too few.
 
     Where a tracker has lost everything a state may run off for nothing: in units of its own path it would not be bent,
@@ -380,15 +382,16 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
 def regauged(b: Bundle, s: Sightings) -> Bundle:
     """The same motion with the link at depth 1 and the anchor at its middle, if they have gone elsewhere.
 
-    Nothing in the pictures of a resting camera holds the scale, and steps along it carry the link away from the anchor;
-    seen from far off every twist looks the same, and the steps stall.
+    Nothing in the pictures of a resting camera holds the scale, nor does a scene whose points and cameras are unknown;
+    steps along it carry the link away from the anchor, and seen from far off every twist looks the same.
     """
-    tw, unit = b.twist, float(np.median(b.X[:, 2]))
+    X = b.X if s.link is None else b.X[s.link]
+    tw, unit = b.twist, float(np.median(X[:, 2]))
     # A link behind the camera has no depth to be brought to 1.
-    if s.R is not None or s.free or unit <= 1e-9:
+    if not s.scaleless or unit <= 1e-9:
         return b
-    away = anchor_of(b.kind, b.X, tw.axis, tw.anchor if b.kind == "prismatic" else tw.point)
-    size = float(np.linalg.norm(np.quantile(b.X, 0.9, axis=0) - np.quantile(b.X, 0.1, axis=0)))
+    away = anchor_of(b.kind, X, tw.axis, tw.anchor if b.kind == "prismatic" else tw.point)
+    size = float(np.linalg.norm(np.quantile(X, 0.9, axis=0) - np.quantile(X, 0.1, axis=0)))
     if abs(np.log(unit)) < GAUGE and np.linalg.norm(tw.anchor - away) < max(size, 1e-9):
         return b
     velocity = tw.direction + np.cross(tw.curvature, away - tw.anchor)
@@ -396,7 +399,8 @@ def regauged(b: Bundle, s: Sightings) -> Bundle:
     if speed < 1e-12:
         return b
     twist = Twist(away / unit, velocity / speed, tw.curvature / speed * unit)
-    return replace(b, twist=twist, q=b.q * speed / unit, X=b.X / unit)
+    shift = None if b.t is None else b.t / unit
+    return replace(b, twist=twist, q=b.q * speed / unit, X=b.X / unit, t=shift)
 
 
 def anchor_of(kind: str, X: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
     Bundle,
     Sightings,
+    frames_held,
     normal_equations,
     positions,
     residuals,
@@ -34,6 +35,8 @@ class Spread:
         q: (T,) of the states, rad or units of the mean depth.
         curvature: (3, 3) of the twist's curvature.  log_focal: of the focal length's logarithm.
         inflation: of the axis' variance over that of white noise.
+        stroke: over its own standard deviation, between the ends that tracks hold. States are relative to the first
+            frame; where that does not show the link their own deviations say nothing of it.
     """
 
     axis_deg: float
@@ -42,6 +45,7 @@ class Spread:
     curvature: np.ndarray
     log_focal: float
     inflation: float
+    stroke: float
 
 
 def clusters(b: Bundle, link: np.ndarray | None = None, cell: float = CELL) -> np.ndarray:
@@ -202,6 +206,7 @@ def spread(b: Bundle, s: Sightings) -> Spread:
         point = 0.0
         q = (by_q - np.outer(b.q, by_unit) / unit) / unit
         q_var = variance(q) + own * (b.q / unit**2) ** 2
+        path = b.q / unit
     else:
         k = np.linalg.norm(tw.curvature)
         a = tw.axis
@@ -213,7 +218,9 @@ def spread(b: Bundle, s: Sightings) -> Spread:
         # The line nearest to the link's middle, across itself: the axis turns about the anchor's foot.
         by_c = (np.eye(3) - np.outer(a, a)) @ (by_c - np.outer(c, by_unit) / unit) / unit
         point = float(np.sqrt(variance(by_c).sum() + own * (np.sum(c**2) - (c @ a) ** 2) / unit**4))
-        q_var = variance(k * by_q + np.outer(b.q, a @ by_w))
+        q = k * by_q + np.outer(b.q, a @ by_w)
+        q_var = variance(q)
+        path = b.q * k
     axis_var = variance(axis)
     plain = b.sigma**2 * np.einsum("kp,pq,kq->k", axis, B, axis).sum()
     curvature = by_w @ B @ by_w.T * white
@@ -224,7 +231,10 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     q_std = np.sqrt(np.minimum(q_var, _widest(b) ** 2))
     q_std[0] = 0.0
     inflation = float(axis_var.sum() / max(plain, 1e-30))
-    return Spread(float(np.degrees(np.sqrt(axis_var.sum()))), point, q_std, curvature, focal, inflation)
+    shown = frames_held(s, w)
+    low, high = shown[np.argmin(path[shown])], shown[np.argmax(path[shown])]
+    stroke = float((path[high] - path[low]) / max(np.sqrt(variance(q[high : high + 1] - q[low : low + 1])[0]), 1e-12))
+    return Spread(float(np.degrees(np.sqrt(axis_var.sum()))), point, q_std, curvature, focal, inflation, stroke)
 
 
 def _widest(b: Bundle) -> float:

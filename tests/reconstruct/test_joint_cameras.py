@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import ProviderInfo, Tracks
-from reconstruct.joint.cameras import before_the_link, camera_moves, rougher
+from reconstruct.joint.cameras import before_the_link, camera_moves, joints_between, rougher
 from reconstruct.joint.fit import fit_joint
-from reconstruct.joint.groups import rigid_group
+from reconstruct.joint.groups import Rigid, between, rigid_group
 from reconstruct.joint.models import joint_transform
-from reconstruct.joint.twist import twist_of_joint
+from reconstruct.joint.polish import Bundle, Sightings, regauged, residuals
+from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.video import Video
 from tests.reconstruct.joint_scenes import FOCAL, H, W, project
 
@@ -99,6 +100,72 @@ def test_a_body_that_is_all_there_is_may_be_a_scene_before_a_camera_that_goes_ro
         fit = fit_joint(*filmed(tracks), FOCAL, camera_moving=moving)
         assert (fit.verdict, fit.type) == (verdict, "revolute")
         assert fit.reason.startswith("all that is followed moves as one body") == (moving is None)
+
+
+def rigid(R, t, X, shown):
+    return Rigid(R, t, X, np.ones(len(X), bool), 0.5, np.zeros(len(X)), shown)
+
+
+def test_frames_that_do_not_show_the_link_have_no_say_in_where_it_is_started():
+    """Their poses run off, and would be most of the stroke."""
+    rng, T = np.random.default_rng(0), 30
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(25), T), [0, 1, 0])).as_matrix()
+    t = np.array([0, 0, 1.9]) - turn @ [0, 0, 1.9]
+    slide = Twist(np.array([0.1, 0.0, 1.0]), np.array([0.6, 0.8, 0.0]), np.zeros(3))
+    q = 0.02 * np.sin(np.linspace(0, np.pi, T))
+    R_link, t_link = before_the_link(slide, q, turn, t)
+    shown = np.ones(T, bool)
+    shown[12:17] = False
+    t_link[~shown] += rng.normal(size=(5, 3))
+    X = slide.anchor + rng.uniform(-0.1, 0.1, (20, 3))
+    start = joints_between(rigid(turn, t, X, np.ones(T, bool)), rigid(R_link, t_link, X, shown))["prismatic"]
+    assert abs(start.twist.direction @ slide.direction) > 0.999
+    assert np.ptp(start.q) == pytest.approx(np.ptp(q[shown]), rel=0.02)
+    assert joints_between(rigid(turn, t, X, shown), rigid(R_link, t_link, X, ~shown)) == {}
+
+
+def test_poses_of_frames_that_show_nothing_are_between_those_around():
+    R = Rotation.from_rotvec(np.outer(np.arange(6) * 0.1, [0, 0, 1])).as_matrix()
+    t = np.outer(np.arange(6.0), [1, 0, 0])
+    shown = np.array([False, True, True, False, True, False])
+    lost_R, lost_t = R.copy(), t.copy()
+    lost_R[~shown], lost_t[~shown] = np.eye(3), 100.0
+    found = between(lost_R, lost_t, shown)
+    np.testing.assert_allclose(found[0], R[[1, 1, 2, 3, 4, 4]], atol=1e-12)
+    np.testing.assert_allclose(found[1], t[[1, 1, 2, 3, 4, 4]], atol=1e-12)
+
+
+def test_a_world_whose_scale_has_run_away_is_brought_back_with_its_cameras():
+    rng, T, scale = np.random.default_rng(0), 8, 0.03
+    X = np.concatenate([rng.uniform([-0.2, -0.2, 0.9], [0.2, 0.2, 1.1], (10, 3)), rng.uniform(0.8, 1.6, (12, 3))])
+    twist, speed = twist_of_joint("revolute", AXIS, POINT, X[:10].mean(0))
+    R = Rotation.from_rotvec(np.outer(np.linspace(0, 0.3, T), [0, 1, 0])).as_matrix()
+    t = np.outer(np.linspace(0, 0.2, T), [1.0, 0.2, 0.0])
+    link = np.arange(22) < 10
+    zero = np.zeros((22, T, 2))
+    s = Sightings(zero, np.ones((22, T), bool), np.ones(22), FOCAL, R=R, t=t, link=link, free=True)
+    right = Bundle("revolute", twist, np.linspace(0, 0.3, T) * speed, X, R=R, t=t)
+    small = Twist(twist.anchor * scale, twist.direction, twist.curvature / scale)
+    away = Bundle("revolute", small, right.q * scale, X * scale, R=R, t=t * scale)
+    back = regauged(away, s)
+    assert np.median(back.X[link][:, 2]) == pytest.approx(1.0)
+    np.testing.assert_allclose(residuals(back, s), residuals(right, s), atol=1e-8)
+    assert regauged(back, s) is back
+
+
+@pytest.mark.slow
+def test_a_link_that_is_out_of_sight_at_first():
+    uv = scene(frames=40, orbit_deg=30.0)[0]
+    uv[120:, :14] = np.nan
+    fit = fit_joint(*filmed(uv), FOCAL, camera_moving=True)
+    assert (fit.verdict, fit.type) == ("ok", "revolute")
+    axis = fit.T_camera_world[:3, :3] @ fit.axis
+    assert np.degrees(np.arccos(min(1.0, abs(axis @ AXIS)))) < min(4 * fit.std["axis_deg"], 2.0)
+    s = np.clip((np.arange(40) - 5) / 30, 0, 1)
+    q = 3 * s**2 - 2 * s**3
+    np.testing.assert_allclose(np.abs(fit.q - fit.q[14])[14:], (q - q[14])[14:], atol=0.05)
+    # What is out of sight is taken to rest, not to go on.
+    assert np.ptp(fit.q) < 1.2 * np.ptp(q[14:])
 
 
 @pytest.mark.slow
