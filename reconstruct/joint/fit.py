@@ -418,7 +418,10 @@ def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, se
 
 def _between(static: Rigid, link: Rigid, video: Video, paths: Paths, view: View, full_focal: float
              ) -> tuple[JointFit, float]:  # fmt: skip
-    """The joint between two bodies, and its stroke over that one's standard deviation; arguments of _moving_camera."""
+    """The joint between two bodies, and its stroke over the stroke's standard deviation (0 where it is refused).
+
+    Arguments as of _moving_camera.
+    """
     starts = joints_between(static, link)
     if not starts:
         return JointFit("refused", APART, tracks=len(paths), inliers=int(link.members.sum())), 0.0

@@ -27,7 +27,7 @@ PATCH = (14, 30)
 TILTS_DEG = (25.0, 45.0, 60.0, 70.0, 78.0)
 GROWN = 6
 """Neighbourhoods that are grown to bodies."""
-HOLDERS = 6
+POSE_HOLDERS = 6
 """Tracks that a frame must show for a body's pose to be held there: twice what a pose needs."""
 FINISHED = 3
 """Bodies that are looked at in all frames."""
@@ -339,10 +339,7 @@ def _grow(x, seen, R, t, patch, focal) -> tuple[float, np.ndarray, np.ndarray, n
 
 def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     """From key frames to all frames."""
-    T = x.shape[1]
-    every = np.arange(T)
-    R = Slerp(keys, Rotation.from_matrix(R))(every).as_matrix()
-    t = np.stack([np.interp(every, keys, t[:, k]) for k in range(3)], axis=1)
+    R, t = between(R, t, keys, x.shape[1])
     seen = np.isfinite(x[..., 0])
     some = seen & candidates[:, None]
     sigma = 1.0
@@ -372,19 +369,19 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     if unit <= 0:
         return None
     cost = _track_cost(x, seen, R, t, X, focal, 4 * max(sigma, 0.25))
-    shown = seen[members].sum(0) >= HOLDERS
+    shown = seen[members].sum(0) >= POSE_HOLDERS
     if shown.sum() < 2:
         return None
-    R, t = between(R, t, shown)
+    R, t = between(R[shown], t[shown], np.flatnonzero(shown), len(R))
     return Rigid(R, t / unit, X / unit, members, sigma, cost, shown)
 
 
-def between(R: np.ndarray, t: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (T, 3, 3), (T, 3) with those of frames that are not shown (T,) between the ones around them."""
-    known, every = np.flatnonzero(shown), np.arange(len(R))
-    inside = np.clip(every, known[0], known[-1])
-    R = Slerp(known, Rotation.from_matrix(R[known]))(inside).as_matrix()
-    return R, np.stack([np.interp(every, known, t[known, k]) for k in range(3)], axis=1)
+def between(R: np.ndarray, t: np.ndarray, known: np.ndarray, T: int) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T, 3, 3), (T, 3) of all frames from those (k, 3, 3), (k, 3) of the frames ``known`` (k,): between the ones
+    around, and beyond the outermost like these."""
+    every = np.clip(np.arange(T), known[0], known[-1])
+    turned = Slerp(known, Rotation.from_matrix(R))(every).as_matrix()
+    return turned, np.stack([np.interp(every, known, t[:, k]) for k in range(3)], axis=1)
 
 
 def adjust(x, seen, R, t, X, focal, iterations: int = 8, slip=None):

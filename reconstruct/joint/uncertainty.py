@@ -35,8 +35,8 @@ class Spread:
         q: (T,) of the states, rad or units of the mean depth.
         curvature: (3, 3) of the twist's curvature.  log_focal: of the focal length's logarithm.
         inflation: of the axis' variance over that of white noise.
-        stroke: over its own standard deviation, between the ends that tracks hold. States are relative to the first
-            frame; where that does not show the link their own deviations say nothing of it.
+        stroke: the stroke over its standard deviation, between the ends that tracks hold. States are relative to the
+            first frame; where that does not show the link their own deviations say nothing of it.
     """
 
     axis_deg: float
