@@ -35,6 +35,8 @@ SOME_SHADOWS, SHADOWS = 0.4, 0.75
 """Shares of the tracks that follow a joint (of all that moves, where none is found) on edges of shadows: from the first
 on it is asked for without them (right answers on rendered clips have up to 0.33, wrong ones 0.5 to 1), from the second
 on it is a shadow's."""
+BESIDE_PX = 10.0
+"""Working px within which a track is on the shadow of which another is on the edge: the windows of both see it."""
 
 
 class Progress(Protocol):
@@ -359,9 +361,13 @@ def _unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[
 
     The shadow of a hand slides over a table as exactly as a drawer, and together with a part's own tracks a shadow
     bends the joint, or makes it none. Where nothing is found without them either, a joint is refused if nearly all of
-    it are such edges, else ambiguous.
+    it are such edges or it is doubtful by itself, else ambiguous. What is found without them is ambiguous where nearly
+    all of it may be on shadows too, and refused where it is doubtful besides.
     """
     from reconstruct.joint.fit import moving_tracks
+
+    def refuse(joint: JointFit, words: str) -> JointFit:
+        return JointFit("refused", f"what moves is a shadow: {words}", tracks=joint.tracks, inliers=joint.inliers)
 
     refused = fit.verdict == "refused"
     agree = moving_tracks(video, tracks) if refused else fit.point_track
@@ -369,13 +375,38 @@ def _unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[
         return fit
     again = ask(replace(tracks, visible=tracks.visible & ~tracks.cast[:, None]))
     if again.verdict != "refused":
-        return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+        if np.mean(may := _maybe_shadows(video, tracks, again.point_track)) < SHADOWS:
+            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+        words = f"without the edges of one, {int(may.sum())} of the {len(may)} tracks that agree may lie on it too"
+        if again.verdict != "ok":
+            return refuse(again, f"{words}, and {_first(again.reason)}")
+        return replace(again, verdict="ambiguous", reason=f"what moves may be a shadow: {words}; {again.reason}")
     if refused:
         return fit
     words = f"{int(cast.sum())} of the {len(agree)} tracks that agree lie on the edge of one"
-    if cast.mean() < SHADOWS:
-        return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
-    return JointFit("refused", f"what moves is a shadow: {words}", tracks=fit.tracks, inliers=fit.inliers)
+    if cast.mean() >= SHADOWS:
+        return refuse(fit, words)
+    if fit.verdict != "ok":
+        return refuse(fit, f"{words}, and {_first(fit.reason)}")
+    return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
+
+
+def _first(reason: str) -> str:
+    """Of a reason, what comes before the advice."""
+    return reason.split("; ")[0]
+
+
+def _maybe_shadows(video: Video, tracks: Tracks, some: np.ndarray) -> np.ndarray:
+    """(n,) bool, which of these tracks (n,) may be a shadow's: on an edge of brightness alone, or for half of the time
+    beside a track that is on a shadow's edge."""
+    shade = tracks.cast if tracks.shade is None else tracks.shade
+    uv, seen = video.to_work(tracks.uv), tracks.visible
+    beside = np.zeros((len(some), len(video)), bool)
+    for t in range(len(video)):
+        here, edge = np.flatnonzero(seen[some, t]), tracks.cast & seen[:, t]
+        far = np.linalg.norm(uv[some[here], t][:, None] - uv[edge, t][None], axis=-1)
+        beside[here, t] = far.min(1, initial=np.inf) < BESIDE_PX
+    return shade[some] | (2 * beside.sum(1) > seen[some].sum(1))
 
 
 def _off_shadows(video: Video, tracks: Tracks) -> Tracks:

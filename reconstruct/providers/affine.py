@@ -26,6 +26,10 @@ REWEIGHTED = (0, 3)
 GREY, SHARE = 8.0, 0.35
 """Grey values by which pixels that do may differ at least; how much of the window, weighted, has to."""
 LARGEST_STEP_PX, LARGEST_SHEAR = 2.0, 0.3
+SAMPLED = 4 / 9
+"""Variance that bilinear sampling leaves of a pixel's noise, in the mean over places between pixels."""
+LEAST_RELIABLE = 0.3
+"""Share of a window's variance that is taken for more than noise, at least."""
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
@@ -64,7 +68,7 @@ def _residuals(wide: np.ndarray, target: np.ndarray, weight: np.ndarray, p: np.n
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, place: np.ndarray, shape: np.ndarray,
-             half: int = HALF) -> np.ndarray:  # fmt: skip
+             noise: float = 0.0, half: int = HALF) -> np.ndarray:  # fmt: skip
     """Register neighbourhoods of anchor frames in another frame, in place.
 
     Args:
@@ -72,10 +76,12 @@ def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, p
         now: the frame to register in.
         place: (N, 2) px, starts; becomes where the middles are.
         shape: (N, 2, 2) starts; becomes the derivative of the place in `now` by that in the anchor frame.
+        noise: standard deviation of the frames' pixels, grey values.
 
     Returns:
-        (N,) normalised correlation of what belongs together in the neighbourhoods, in [-1, 1]; -2 where one leaves the
-        picture, has no structure, or less than SHARE of it belongs together.
+        (N,) normalised correlation of what belongs together in the neighbourhoods, as it would be without the noise
+        (Spearman's correction for attenuation, 1904; a faint texture's is taken for half noise at most), in [-1, 1]; -2
+        where one leaves the picture, has no structure, or less than SHARE of it belongs together.
     """
     n, side = len(at), 2 * half + 1
     height, width = frames.shape[1], frames.shape[2]
@@ -194,6 +200,7 @@ def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, p
             if move < DONE_PX and shear * half < 2 * DONE_PX and turn > REWEIGHTED[-1]:
                 break
         if correlation > -2.0 and share > SHARE:
-            out[k] = correlation
+            reliable = max(1.0 - SAMPLED * noise * noise / power, LEAST_RELIABLE)
+            out[k] = min(correlation / reliable, 1.0)
             place[k], shape[k] = p, S
     return out

@@ -53,3 +53,22 @@ def test_says_where_it_cannot():
     assert onto_itself[0] == pytest.approx(1.0) and onto_itself[1] == -2  # the second leaves the picture
     assert register(frames, np.ones(2, int), at, 0, at.copy(), same.copy())[0] == -2  # no structure
     assert register(frames, np.zeros(2, int), at, 2, at.copy(), same.copy())[0] < 0.8  # another picture
+
+
+@pytest.mark.parametrize("contrast", [1.9, 4.0, 40.0])
+def test_noise_does_not_make_a_faint_picture_another_one(contrast):
+    """The same surface is told from another one at any contrast, the noise given."""
+    rng = np.random.default_rng(0)
+    sigma, A = 2.0, np.array([[0.98, 0.05], [-0.05, 0.99]])
+    faint = [100 + contrast * (p - p.mean()) / p.std() for p in (picture(3), picture(4))]
+    seen = (faint[0], warped(faint[0], A), faint[1])
+    frames = np.stack([p + rng.normal(0, sigma, p.shape) for p in seen]).clip(0, 255).round().astype(np.uint8)
+    at = MIDDLE + rng.uniform(-35, 35, (60, 2))
+    true = (at - MIDDLE) @ A.T + MIDDLE
+    turned = np.tile(A, (60, 1, 1))
+    same = register(frames, np.zeros(60, int), at, 1, true.copy(), turned.copy(), sigma)
+    other = register(frames, np.zeros(60, int), at, 2, at.copy(), turned.copy(), sigma)
+    assert np.quantile(same, 0.1) > 0.8 > np.quantile(other, 0.8)
+    assert np.all(same <= 1)
+    if contrast < sigma:
+        assert np.median(register(frames, np.zeros(60, int), at, 1, true.copy(), turned.copy())) < 0.8

@@ -2,9 +2,20 @@
 
 import cv2
 import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from reconstruct.cues import Hands, ProviderInfo
-from reconstruct.providers.lk_tracks import change_region, enclosed, even_exposure, reference_frames, track_points
+from reconstruct.providers.lk_tracks import (
+    LEAST_PIECE,
+    change_region,
+    enclosed,
+    even_exposure,
+    pieces,
+    pixel_noise,
+    reference_frames,
+    track_points,
+)
 from tests.reconstruct.joint_scenes import make_video
 from tests.reconstruct.textures import turning_plate
 
@@ -77,3 +88,72 @@ def test_what_the_rim_encloses_is_seeded_too():
     inside = enclosed(ring)
     assert inside[30:50, 40:80].all() and not (inside & ring).any()
     assert not inside[:18].any() and not inside[60:, 100:].any()
+
+
+def test_faint_texture_in_noise_is_followed_by_its_first_picture(monkeypatch):
+    """Noise hides that a faint surface looks like itself; it would be lost in every frame."""
+    H = turning_plate(24)[1]
+    rng = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(rng.standard_normal((360, 480)), (0, 0), 1.5)
+    paint = np.zeros_like(grain)
+    paint[120:260, 180:330] = 150 + 2.5 * grain[120:260, 180:330] / grain.std()
+    seen = np.stack([cv2.warpPerspective(paint, h, paint.shape[::-1]) for h in H])
+    frames = np.where(seen > 75, seen, 100) + rng.normal(scale=2.0, size=seen.shape)
+    frames = np.repeat(np.clip(frames + 0.5, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+    video = make_video(len(frames)).with_frames(frames)
+    assert 1.7 < pixel_noise(np.stack(even_exposure(video))) < 2.4
+
+    def off() -> np.ndarray:
+        """px, of the observations of points well inside the plate that have gone by 5 px or more."""
+        tracks, out = track_points(video), []
+        for uv, r in zip(tracks.uv.astype(float), tracks.reference, strict=True):
+            base = cv2.perspectiveTransform(uv[r].reshape(1, 1, 2), np.linalg.inv(H[r]))
+            if not (200 < base[0, 0, 0] < 310 and 140 < base[0, 0, 1] < 240):
+                continue
+            true = np.array([cv2.perspectiveTransform(base, h)[0, 0] for h in H])
+            gone = np.linalg.norm(true - true[r], axis=1) > 5
+            out.append(np.linalg.norm(true - uv, axis=-1)[gone & np.isfinite(uv[:, 0])])
+        return np.concatenate(out)
+
+    told = off()
+    monkeypatch.setattr("reconstruct.providers.lk_tracks.pixel_noise", lambda grey: 0.0)
+    untold = off()
+    assert np.median(told) < 0.35
+    assert (told < 1).sum() > 2 * (untold < 1).sum()
+
+
+def test_what_was_lost_is_another_track_afterwards():
+    T = 40
+    uv = np.stack([np.arange(T), np.zeros(T)], axis=-1)[None].repeat(3, axis=0).astype(np.float32)
+    uv[1, :5] = uv[1, 30:] = np.nan
+    lost = np.zeros((3, T), bool)
+    lost[0, [25, 30]] = lost[0, 8] = True  # of what is seen after 25, five frames are too few for a track
+    lost[2, 20] = True
+    out, start = pieces(uv, np.array([12, 12, 20 - 1]), lost)
+    spans = [(int(f[0]), int(f[-1])) for f in (np.flatnonzero(np.isfinite(row[:, 0])) for row in out)]
+    assert spans[:3] == [(9, 24), (5, 29), (0, 19)]
+    assert sorted(zip(spans[3:], start[3:].tolist(), strict=True)) == [((0, 9), 9), ((19, 39), 19), ((29, 39), 29)]
+    for row, frame in zip(out, start, strict=True):
+        assert row[frame, 0] == frame and set(np.diff(np.flatnonzero(np.isfinite(row[:, 0])))) == {1}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6))
+def test_pieces_keep_every_long_stretch_once(seed):
+    rng = np.random.default_rng(seed)
+    N, T = 6, 50
+    reference = rng.integers(0, T, N)
+    low, high = rng.integers(0, reference + 1), rng.integers(reference, T)
+    seen = (np.arange(T) >= low[:, None]) & (np.arange(T) <= high[:, None])
+    uv = np.where(seen[..., None], rng.uniform(0, 100, (N, T, 2)), np.nan)
+    lost = seen & (rng.random((N, T)) < 0.08)
+    lost[np.arange(N), reference] = False
+    out, start = pieces(uv, reference, lost)
+    held = np.isfinite(out[..., 0])
+    assert np.isfinite(out[np.arange(len(out)), start, 0]).all()
+    assert (held[N:].sum(1) >= LEAST_PIECE).all()
+    # An observation is in one piece, or in two where one ends and the next one begins.
+    for frame in range(T):
+        values = out[held[:, frame], frame, 0]
+        assert np.isin(values, uv[:, frame, 0]).all()
+        assert (np.unique(values, return_counts=True)[1] <= 2).all()
