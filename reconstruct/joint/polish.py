@@ -87,7 +87,7 @@ class Sightings:
         shown = [self.seen] if self.link is None else [self.seen[self.link], self.seen[~self.link]]
         f, blind = f / max(float(np.mean(np.diff(f))), 1e-9), ~np.all([x.any(0) for x in shown], axis=0)
         D, E = second_difference(f), np.diff(np.eye(T), axis=0) / np.sqrt(np.diff(f))[:, None]
-        E = E[(blind[1:] | blind[:-1]) & (self.slip is None)]
+        E = E[blind[1:] | blind[:-1]]
         return D.T @ D + (BEND / WALK) ** 2 * E.T @ E
 
 
@@ -296,8 +296,7 @@ def frames_held(s: Sightings, w: np.ndarray) -> np.ndarray:
     if s.link is not None:
         near = near[s.link]
     held = np.flatnonzero(near.sum(0) >= HOLDERS)
-    # Trackers that measure what the picture holds drop what they have lost.
-    return held if len(held) > 1 and s.slip is None else np.arange(len(near[0]))
+    return held if len(held) > 1 else np.arange(len(near[0]))
 
 
 def radius_cost(b: Bundle, s: Sightings) -> float:

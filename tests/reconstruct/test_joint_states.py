@@ -82,13 +82,25 @@ def test_an_end_without_tracks_does_not_run_off():
     assert np.ptp(turned[since:]) < 0.15
 
 
-def test_what_nothing_sees_comes_to_rest():
+@pytest.mark.parametrize("own", [False, True])
+def test_what_nothing_sees_comes_to_rest(own):
+    """Of tracks that measure how far they slide along edges as well."""
     truth, s = scene("revolute", 3)
     seen = s.seen.copy()
     seen[:, -10:] = False
-    b = polish(truth, replace(s, seen=seen))
+    b = polish(truth, replace(s, seen=seen, slip=np.zeros_like(s.uv) if own else None))
     speed = np.abs(np.diff(b.q))
     assert speed[-3:].max() < 0.1 * speed[:-12].max()
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_what_has_run_off_out_of_sight_comes_back(own):
+    truth, s = scene("revolute", 3, frames=60)
+    seen, q = s.seen.copy(), truth.q.copy()
+    seen[:, 20:36] = False
+    q[20:36] = 1e3 * np.ptp(truth.q) * np.sin(np.linspace(0, np.pi, 16))
+    b = polish(replace(truth, q=q), replace(s, seen=seen, slip=np.zeros_like(s.uv) if own else None), iterations=30)
+    assert np.abs(b.q - truth.q).max() < 0.5 * np.ptp(truth.q)
 
 
 def _slide(hinge: Bundle) -> Bundle:
