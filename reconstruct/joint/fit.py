@@ -77,8 +77,9 @@ PARTS = (slice(0, 7), slice(3, 10))
 the picture holds a point: these lose a door that is seen on edge, and go on saying where it is."""
 PART_TURN_DEG = 30.0
 """Turn from which a hinge is believed of a part of the motion: over a short way every motion turns about something."""
-LUCKIER = 1.1
-"""What a later draw, or another stretch of the video, has to explain more than those before it."""
+LUCKIER, SHARPER = 1.1, 3.0
+"""What a later draw, or another stretch of the video, has to explain more than those before it; or, if a draw explains
+no less, how many times less its points have to miss the joint by."""
 
 
 def fit_joint(
@@ -122,14 +123,19 @@ def fit_joint(
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
             return fit or JointFit("refused", NO_SCENE, tracks=len(paths))
-    answer, most = None, 0.0
+    answer, most, sigma = None, 0.0, np.nan
     for k in range(TRIES):
-        fit, worth = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES))
-        # Asked often enough something may pass for a joint: a later draw has to explain what the others missed.
-        if fit.verdict != "refused" and worth > LUCKIER * most:
+        draw = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES))
+        fit = draw.fit
+        # Asked often enough something may pass for a joint: a later draw has to explain what the others missed, or no
+        # less by far more exactly.
+        sharp = draw.explained > most and SHARPER * draw.sigma < sigma
+        if fit.verdict != "refused" and (draw.explained > LUCKIER * most or sharp):
             answer = fit
             break
-        answer, most = answer or fit, max(most, worth)
+        answer = answer or fit
+        if draw.explained > most:
+            most, sigma = draw.explained, draw.sigma
         if fit.inliers == 0:
             break  # this was no bad luck: there is nothing to draw from
     assert answer is not None
@@ -163,7 +169,7 @@ def _of_a_part(video: Video, paths: Paths, camera: _Camera, view: View, known: f
     cuts = np.concatenate([[0], np.searchsorted(path, path[-1] * np.arange(1, 10) / 10) + 1, [len(video)]])
     for part in PARTS:
         span = slice(int(cuts[part.start]), int(cuts[part.stop]))
-        fit, _ = _one_draw(video, _only(paths, span), camera, view, known, rng, pictures, lambda _: None)
+        fit = _one_draw(video, _only(paths, span), camera, view, known, rng, pictures, lambda _: None).fit
         if fit.verdict == "ok" and fit.type == "revolute" and np.ptp(fit.q) > np.radians(PART_TURN_DEG):
             words = f"frames {span.start} to {span.stop - 1} of {len(video)} follow it, and all together no joint"
             return replace(fit, reason=f"{fit.reason}; {words}")
@@ -185,8 +191,8 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
-              pictures: Pictures | None, tell: Callable[[float], None]) -> tuple[JointFit, float]:  # fmt: skip
-    """The joint before a camera that rests or is held in a hand, by one draw of hypotheses, and the motion it explains.
+              pictures: Pictures | None, tell: Callable[[float], None]) -> _Draw:  # fmt: skip
+    """The joint before a camera that rests or is held in a hand, by one draw of hypotheses.
 
     Args:
         paths: of all tracks, working px.
@@ -195,6 +201,10 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
     """
     note = ""
     found = _consensus(paths, camera, rng, lambda x: tell(0.85 * x))
+
+    def refused(reason: str, members: np.ndarray, sigma: float = np.nan) -> _Draw:
+        return _Draw(JointFit("refused", reason, tracks=len(paths), inliers=len(members)), found.explained, sigma)
+
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
         stretches = motion_stretches(paths.uv[_moving(paths, camera.diagonal)], video.time)
@@ -206,7 +216,7 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
             found = _dominant(tries)
             note = f"; no joint explains the whole video: the dominant of {len(stretches)} stretches of motion is taken"
     if found.refusal:
-        return JointFit("refused", found.refusal, tracks=len(paths), inliers=len(found.members)), found.explained
+        return refused(found.refusal, found.members)
     tell(0.9)
     try:
         if video.warp is None:
@@ -217,13 +227,14 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
             done, restless, words = _hand_held(found, paths, video.warp, view, camera)
             note += words
     except NoLink:
-        return JointFit("refused", NO_LINK, tracks=len(paths), inliers=len(found.members)), found.explained
+        return refused(NO_LINK, found.members)
     if reason := why_not_believed(done, restless):
-        return JointFit("refused", reason, tracks=len(paths), inliers=len(done.members)), found.explained
+        return refused(reason, done.members, done.bundle.sigma)
     if pictures is not None and video.warp is None and (exact := by_faces(done, pictures)) is not done:
         done, note = exact, f"{note}; its faces' pixels hold the axis"
     full = camera.focal / video.scale
-    return result_of(video, done, full, len(paths), note, KNOWN_STD if known else None), found.explained
+    fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
+    return _Draw(fit, found.explained, done.bundle.sigma)
 
 
 def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:
@@ -261,6 +272,15 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
     view, scene = scaled_to_link(path, leading, as_filmed, found.members, view)
     done = finish(found.starts, as_filmed, found.members, view, scene)
     return done, path.sigma, "; the camera moves: its path is fitted together with the joint"
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """fit: joint or refusal.  explained: motion of all tracks.  sigma: px, noise of its own, NaN without a joint."""
+
+    fit: JointFit
+    explained: float
+    sigma: float
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from reconstruct.joint import fit as fit_module
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.fit import fit_joint
-from reconstruct.joint.models import joint_transform
+from reconstruct.joint.models import JointFit, joint_transform
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.select import _tilted_back, explained, key_frames, observations, worth
 from tests.reconstruct.joint_scenes import H, W, make_scene, make_video, project
@@ -151,6 +151,21 @@ def test_a_search_that_is_out_of_luck_is_drawn_again(monkeypatch):
     assert (fit.verdict, fit.reason, len(asked)) == ("refused", "draw 1", fit_module.TRIES + len(fit_module.PARTS))
     fit = unlucky(1, explained=1.0)
     assert (fit.verdict, fit.reason) == ("refused", "draw 1")
+
+
+@pytest.mark.parametrize(("explained", "sigma", "verdict"), [
+    (1.05, 0.1, "ok"),  # no less, and far more exactly
+    (1.05, 0.2, "refused"),
+    (0.95, 0.1, "refused"),
+    (1.15, 0.5, "ok"),  # what the first one missed
+])  # fmt: skip
+def test_a_later_draw_is_believed_if_it_explains_more_or_far_more_exactly(monkeypatch, explained, sigma, verdict):
+    scene = make_scene(**SCENES["drawer"])
+    first = fit_module._Draw(JointFit("refused", "a free body", inliers=50), 1.0, 0.5)
+    second = fit_module._Draw(JointFit("ok", "made"), explained, sigma)
+    draws = iter([first, second, *[first] * 9])
+    monkeypatch.setattr(fit_module, "_one_draw", lambda *_: next(draws))
+    assert fit_joint(scene.video, scene.tracks, focal_px=768.0).verdict == verdict
 
 
 def test_nothing_moving_is_refused():
