@@ -28,15 +28,6 @@ if TYPE_CHECKING:
 
 ARM_SHARE = 0.2
 """Where no joint is found and this share of what moves stays on a forearm, it is sought without the arms' tracks."""
-LIT_TRACKS, LIT_SHARE = 40, 0.5
-"""What has to be left of the tracks that move for those on edges of brightness alone to be left out. Where most are on
-such edges the world is grey, and they say nothing of shadows (three real clips: 68 to 76 %)."""
-SOME_SHADOWS, SHADOWS = 0.4, 0.75
-"""Shares of the tracks that follow a joint (of all that moves, where none is found) on edges of shadows: from the first
-on it is asked for without them (right answers on rendered clips have up to 0.33, wrong ones 0.5 to 1), from the second
-on it is a shadow's."""
-BESIDE_PX = 10.0
-"""Working px within which a track is on the shadow of which another is on the edge: the windows of both see it."""
 
 
 class Progress(Protocol):
@@ -334,13 +325,14 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.fit import fit_joint, moving_tracks
+    from reconstruct.joint.shadows import off_shadows, unless_a_shadow
     from reconstruct.providers.lk_tracks import pictures_of
 
     pictures = pictures_of(video, hands)
     arm = on_forearm(tracks, hands)
     share = float(np.mean(arm[moving])) if len(moving := moving_tracks(video, tracks)) else 0.0
     rest = replace(tracks, visible=tracks.visible & ~arm[:, None]) if share > 0 else tracks
-    lit = _off_shadows(video, rest)
+    lit = off_shadows(video, rest)
 
     def ask(some: Tracks) -> JointFit:
         return fit_joint(video, some, focal, seed, progress, camera_moving=False, pictures=pictures)
@@ -348,78 +340,12 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     fit, asked = ask(lit), lit
     if fit.verdict == "refused" and lit is not rest:
         fit, asked = ask(rest), rest
-    fit = _unless_a_shadow(fit, video, asked, ask)
+    fit = unless_a_shadow(fit, video, asked, ask)
     if fit.verdict == "refused" and share >= ARM_SHARE:
-        again = _unless_a_shadow(ask(tracks), video, tracks, ask)
+        again = unless_a_shadow(ask(tracks), video, tracks, ask)
         return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
-
-
-def _unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[Tracks], JointFit]) -> JointFit:
-    """The joint, or where many of its tracks are on edges of shadows, what is found without all of these.
-
-    The shadow of a hand slides over a table as exactly as a drawer, and together with a part's own tracks a shadow
-    bends the joint, or makes it none. Where nothing is found without them either, a joint is refused if nearly all of
-    it are such edges or it is doubtful by itself, else ambiguous. What is found without them is ambiguous where nearly
-    all of it may be on shadows too, and refused where it is doubtful besides.
-    """
-    from reconstruct.joint.fit import moving_tracks
-
-    def refuse(joint: JointFit, words: str) -> JointFit:
-        return JointFit("refused", f"what moves is a shadow: {words}", tracks=joint.tracks, inliers=joint.inliers)
-
-    refused = fit.verdict == "refused"
-    agree = moving_tracks(video, tracks) if refused else fit.point_track
-    if tracks.cast is None or np.sum(cast := tracks.cast[agree]) < max(1, SOME_SHADOWS * len(agree)):
-        return fit
-    again = ask(replace(tracks, visible=tracks.visible & ~tracks.cast[:, None]))
-    if again.verdict != "refused":
-        if np.mean(may := _maybe_shadows(video, tracks, again.point_track)) < SHADOWS:
-            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
-        words = f"without the edges of one, {int(may.sum())} of the {len(may)} tracks that agree may lie on it too"
-        if again.verdict != "ok":
-            return refuse(again, f"{words}, and {_first(again.reason)}")
-        return replace(again, verdict="ambiguous", reason=f"what moves may be a shadow: {words}; {again.reason}")
-    if refused:
-        return fit
-    words = f"{int(cast.sum())} of the {len(agree)} tracks that agree lie on the edge of one"
-    if cast.mean() >= SHADOWS:
-        return refuse(fit, words)
-    if fit.verdict != "ok":
-        return refuse(fit, f"{words}, and {_first(fit.reason)}")
-    return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
-
-
-def _first(reason: str) -> str:
-    """Of a reason, what comes before the advice."""
-    return reason.split("; ")[0]
-
-
-def _maybe_shadows(video: Video, tracks: Tracks, some: np.ndarray) -> np.ndarray:
-    """(n,) bool, which of these tracks (n,) may be a shadow's: on an edge of brightness alone, or for half of the time
-    beside a track that is on a shadow's edge."""
-    shade = tracks.cast if tracks.shade is None else tracks.shade
-    uv, seen = video.to_work(tracks.uv), tracks.visible
-    beside = np.zeros((len(some), len(video)), bool)
-    for t in range(len(video)):
-        here, edge = np.flatnonzero(seen[some, t]), tracks.cast & seen[:, t]
-        far = np.linalg.norm(uv[some[here], t][:, None] - uv[edge, t][None], axis=-1)
-        beside[here, t] = far.min(1, initial=np.inf) < BESIDE_PX
-    return shade[some] | (2 * beside.sum(1) > seen[some].sum(1))
-
-
-def _off_shadows(video: Video, tracks: Tracks) -> Tracks:
-    """The tracks without what may be the edge of a shadow, or the same where too little that moves would be left."""
-    from reconstruct.joint.fit import moving_tracks
-
-    if tracks.shade is None:
-        return tracks
-    moving = moving_tracks(video, tracks)
-    left = int((~tracks.shade[moving]).sum())
-    if left == len(moving) or left < max(LIT_TRACKS, LIT_SHARE * len(moving)):
-        return tracks
-    return replace(tracks, visible=tracks.visible & ~tracks.shade[:, None])
 
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,

@@ -17,6 +17,8 @@ LOOKS = 24
 CONTRAST, COLOUR = 0.2, 0.25
 """Logarithm of the brighter side over the darker one from which on a shadow may be the reason (fainter edges are mostly
 grain), and the share of it by which a single channel may differ."""
+FEW = 0.03
+"""Share of a window's pixels that make a side at least: the tip of a finger's shadow is a tenth of it."""
 DARKEST = 4.0
 """Values below which a channel says nothing."""
 STAYS_LOOKS, TIMES = 8, 16
@@ -111,7 +113,7 @@ def _one_side_darkened(change: np.ndarray, bell: np.ndarray) -> np.ndarray:
 def _two_sides(patch: np.ndarray, bell: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean colours (n, 3) of the brighter and the darker part of the pixels (n, m, 3), and (n, m) bool which."""
     grey = patch.mean(-1)
-    low, high = np.quantile(grey, [0.1, 0.9], axis=1)
+    low, high = np.quantile(grey, [FEW, 1 - FEW], axis=1)
     above = grey > ((low + high) / 2)[:, None]
     return _mean(patch, above * bell), _mean(patch, ~above * bell), above
 

@@ -15,7 +15,8 @@ from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import Reach, normal_equations, place_points, polish, positions, residuals
 from reconstruct.joint.result import stay
-from reconstruct.pipeline import _maybe_shadows, joint_off_the_arm
+from reconstruct.joint.shadows import maybe_shadows
+from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
 from reconstruct.providers.shade import one_colour, rest_beneath
 from tests.reconstruct.joint_scenes import make_scene
@@ -136,12 +137,13 @@ def test_a_shadows_edge_has_one_colour_on_both_sides_and_a_rim_has_two():
     frame[:, 100:] *= 0.6  # in the shade
     frame[100:, 200:] = [60.0, 110.0, 90.0]  # a part in the shade
     frame[:, :50] *= 0.95  # fainter than any shadow
+    frame[150:, 74:77] *= 0.6  # the tip of a finger's
     noisy = np.random.default_rng(0).normal(scale=1.5, size=(5, *frame.shape)) + frame
     frames = np.clip(noisy, 0, 255).astype(np.uint8)
-    at = np.array([[100.0, 60.0], [200.0, 150.0], [50.0, 60.0], [np.nan, np.nan]])
+    at = np.array([[100.0, 60.0], [200.0, 150.0], [50.0, 60.0], [np.nan, np.nan], [75.0, 150.0]])
     uv = np.repeat(at[:, None], 5, axis=1)
     uv[0, :2] = np.nan
-    assert one_colour(frames, uv).tolist() == [True, False, False, False]
+    assert one_colour(frames, uv).tolist() == [True, False, False, False, True]
 
 
 def passing(dark, count=7):
@@ -171,25 +173,33 @@ def test_under_a_shadow_the_grain_stays_and_under_a_part_of_that_colour_it_does_
 
 
 @pytest.mark.parametrize(("agree", "found", "made", "shade", "verdict", "words"), [
-    (35, False, "ok", 30, "refused", "what moves is a shadow: 30 of the 35"),
-    (60, False, "ok", 30, "ambiguous", "part of what moves is a shadow: 30 of the 60"),
-    (60, False, "ambiguous", 30, "refused", "what moves is a shadow: 30 of the 60 tracks that agree lie on the edge"),
-    (60, True, "ok", 30, "ok", "without what is on a shadow's edge, made"),
-    (60, True, "ambiguous", 70, "ambiguous", "without what is on a shadow's edge, made"),
-    (60, True, "ambiguous", 80, "refused", "what moves is a shadow: without the edges of one, 50 of the 60"),
-    (60, True, "ok", 80, "ambiguous", "what moves may be a shadow: without the edges of one, 50 of the 60"),
-    (80, True, "ok", 30, "ok", "made"),
+    (35, "all", "ok", 30, "refused", "what moves is a shadow: 30 of the 35"),
+    (60, "all", "ok", 30, "ambiguous", "part of what moves is a shadow: 30 of the 60"),
+    (60, "all", "ambiguous", 30, "refused", "what moves is a shadow: 30 of the 60 tracks that agree lie on the edge"),
+    (60, "lit", "ok", 30, "ok", "without what is on a shadow's edge, made"),
+    (60, "lit", "ok", 80, "ok", "without what may be on a shadow, made"),
+    (60, "off", "ok", 80, "ambiguous", "what moves may be a shadow: without the edges of one, 83% of the tracks"),
+    (60, "off", "ok", 70, "ok", "without what is on a shadow's edge, made"),
+    (60, "lit", "ambiguous", 70, "ambiguous", "without what is on a shadow's edge, made"),
+    (60, "lit", "ambiguous", 80, "refused", "what moves is a shadow: without the edges of one, 83% of the tracks"),
+    (80, "lit", "ok", 30, "ok", "made"),
+    (80, "lit", "ok", 60, "ok", "without what may be on a shadow, made"),
+    (80, "off", "ok", 60, "ok", "made"),
+    (160, "lit", "ok", 150, "ok", "made"),
 ])  # fmt: skip
 def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agree, found, made, shade, verdict, words):
+    """Found of all tracks only, without the edges of shadows, or without all that may be on one."""
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     number = np.arange(len(scene.tracks.uv))
     cast = number < 30
     # Nothing is left out beforehand, so that all depends on who agrees.
-    monkeypatch.setattr("reconstruct.pipeline.LIT_SHARE", 2.0)
+    monkeypatch.setattr("reconstruct.joint.shadows.LIT_SHARE", 2.0)
+    monkeypatch.setattr("reconstruct.joint.shadows.BESIDE_PX", 0.0)
 
     def answer(video, tracks, *_, **__):
-        if tracks.visible[cast].any() or found:
-            return JointFit(made, "made", "prismatic", point_track=np.flatnonzero(tracks.visible.any(1))[:agree])
+        seen = tracks.visible.any(1)
+        if seen[cast].any() or found == "lit" or (found == "off" and seen[30:shade].any()):
+            return JointFit(made, "made", "prismatic", point_track=np.flatnonzero(seen)[:agree])
         return JointFit("refused", "nothing moves")
 
     monkeypatch.setattr("reconstruct.joint.fit.fit_joint", answer)
@@ -213,7 +223,7 @@ def test_what_is_beside_a_shadows_edge_may_be_on_it():
     cast, shade = np.arange(6) == 0, np.arange(6) == 5
     start = np.zeros(6, int)
     tracks = replace(scene.tracks, uv=uv, visible=visible, reference=start, slip=None, cast=cast, shade=shade)
-    assert _maybe_shadows(scene.video, tracks, np.arange(1, 6)).tolist() == [False, False, True, False, True]
+    assert maybe_shadows(scene.video, tracks).tolist() == [True, False, False, True, False, True]
 
 
 def test_a_hinge_whose_shadow_goes_along_is_found_without_it():

@@ -1,0 +1,112 @@
+"""Shadows among the tracks: what is asked without them, and when a joint is none of a part's.
+
+The shadow of a hand slides over a table as exactly as a drawer, and together with a part's own tracks a shadow bends
+the joint, or makes it none. Some edges of shadows are seen to be such (``Tracks.cast``: what lies beneath rests),
+others only may be (``Tracks.shade``: both sides have one colour); points beside the first see them in their windows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from reconstruct.cues import Tracks
+from reconstruct.joint.fit import moving_tracks
+from reconstruct.joint.models import JointFit
+from reconstruct.video import Video
+
+LIT_TRACKS, LIT_SHARE = 40, 0.5
+"""What has to be left of the tracks that move for those on edges of brightness alone to be left out. Where most are on
+such edges the world is grey, and they say nothing of shadows (three real clips: 68 to 76 %)."""
+HARDLY_SHADOWS, SOME_SHADOWS, SHADOWS = 0.2, 0.4, 0.75
+"""Shares of the tracks that follow a joint (of all that moves, where none is found) on edges of shadows: below the
+first they do no harm; from the second on it is asked for without them (right answers on rendered clips have up to 0.33,
+wrong ones 0.35 to 1); from the third on it is a shadow's."""
+BESIDE_PX = 10.0
+"""Working px within which a track is on the shadow of which another is on the edge: the windows of both see it."""
+
+
+def off_shadows(video: Video, tracks: Tracks) -> Tracks:
+    """The tracks without what may be the edge of a shadow, or the same where too little that moves would be left."""
+    if tracks.shade is None:
+        return tracks
+    moving = moving_tracks(video, tracks)
+    left = int((~tracks.shade[moving]).sum())
+    if left == len(moving) or left < max(LIT_TRACKS, LIT_SHARE * len(moving)):
+        return tracks
+    return _without(tracks, tracks.shade)
+
+
+def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[Tracks], JointFit]) -> JointFit:
+    """The joint, or where many of its tracks are on shadows, what is found without these.
+
+    First it is asked for without what is seen to be the edge of one, then without all that may be on one, where that is
+    much of what still agrees; the second answer counts if it is a sure one. Where nothing is found without the edges, a
+    joint is refused if nearly all of it are such edges or it is doubtful by itself, else ambiguous. What is found
+    without them is ambiguous where nearly all of it may be on a shadow too, and refused where it is doubtful besides.
+
+    Args:
+        fit: the joint of all these tracks, or a refusal.
+        ask: for the joint of some.
+    """
+    refused = fit.verdict == "refused"
+    agree = moving_tracks(video, tracks) if refused else fit.point_track
+    if tracks.cast is None or not len(agree) or np.mean(cast := tracks.cast[agree]) < HARDLY_SHADOWS:
+        return fit
+    many = np.mean(cast) >= SOME_SHADOWS
+    again = ask(_without(tracks, tracks.cast)) if many else fit
+    if again.verdict != "refused":
+        may = maybe_shadows(video, tracks)
+        share = np.mean(may[again.point_track])
+        if share >= SOME_SHADOWS and (lit := ask(_without(tracks, may))).verdict == "ok":
+            return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
+        if not many:
+            return fit
+        if share < SHADOWS:
+            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+        words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
+        if again.verdict != "ok":
+            return _refuse(again, f"{words}, and {_first(again.reason)}")
+        return replace(again, verdict="ambiguous", reason=f"what moves may be a shadow: {words}; {again.reason}")
+    if refused:
+        return fit
+    words = f"{int(cast.sum())} of the {len(agree)} tracks that agree lie on the edge of one"
+    if np.mean(cast) >= SHADOWS:
+        return _refuse(fit, words)
+    if fit.verdict != "ok":
+        return _refuse(fit, f"{words}, and {_first(fit.reason)}")
+    return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
+
+
+def maybe_shadows(video: Video, tracks: Tracks) -> np.ndarray:
+    """(N,) bool, which tracks may be a shadow's: on its edge, on an edge of brightness alone, or for more than half of
+    the time beside a track that is on a shadow's edge.
+
+    Args:
+        tracks: with ``cast``.
+    """
+    assert tracks.cast is not None
+    may = tracks.cast if tracks.shade is None else tracks.cast | tracks.shade
+    uv, seen = video.to_work(tracks.uv), tracks.visible
+    beside = np.zeros(len(seen), int)
+    for t in range(len(video)):
+        here, edge = np.flatnonzero(seen[:, t]), tracks.cast & seen[:, t]
+        if edge.any():
+            beside[here] += cKDTree(uv[edge, t]).query(uv[here, t])[0] < BESIDE_PX
+    return may | (2 * beside > seen.sum(1))
+
+
+def _without(tracks: Tracks, out: np.ndarray) -> Tracks:
+    return replace(tracks, visible=tracks.visible & ~out[:, None])
+
+
+def _refuse(joint: JointFit, words: str) -> JointFit:
+    return JointFit("refused", f"what moves is a shadow: {words}", tracks=joint.tracks, inliers=joint.inliers)
+
+
+def _first(reason: str) -> str:
+    """Of a reason, what comes before the advice."""
+    return reason.split("; ")[0]
