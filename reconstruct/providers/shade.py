@@ -17,8 +17,9 @@ LOOKS = 24
 CONTRAST, COLOUR = 0.2, 0.25
 """Logarithm of the brighter side over the darker one from which on a shadow may be the reason (fainter edges are mostly
 grain), and the share of it by which a single channel may differ."""
-FEW = 0.03
-"""Share of a window's pixels that make a side at least: the tip of a finger's shadow is a tenth of it."""
+SIDE, TIP, CLEAN = 0.1, 0.03, 0.25
+"""Share of a window's pixels that make a side at least; the same for the tip of a finger's shadow, and over the step
+between the two the most by which pixels may scatter about their sides' for it: of grain a few are always darkest."""
 DARKEST = 4.0
 """Values below which a channel says nothing."""
 STAYS_LOOKS, TIMES = 8, 16
@@ -50,7 +51,7 @@ def one_colour(frames: np.ndarray, uv: np.ndarray) -> np.ndarray:
         if not len(seen):
             continue
         patch = _light(frames[t])[_around(uv[seen, t], frames.shape[1:3])].reshape(len(seen), -1, 3)
-        gap = np.subtract(*_two_sides(patch, bell)[:2])
+        gap = _step(patch, bell)
         contrast[seen, k] = gap.mean(1)
         colour[seen, k] = np.abs(gap - gap.mean(1, keepdims=True)).max(1)
     out = np.zeros(N, bool)
@@ -99,7 +100,7 @@ def rest_beneath(frames: np.ndarray, uv: np.ndarray, hidden: np.ndarray | None =
 
 def _one_side_darkened(change: np.ndarray, bell: np.ndarray) -> np.ndarray:
     """(n,) bool of logarithms of ratios (n, m, 3) between two times."""
-    high, low, above = _two_sides(change, bell)
+    high, low, above = _two_sides(change, bell, TIP)
     factor = high.mean(1) - low.mean(1)
     rises, falls = np.abs(high.mean(1)), np.abs(low.mean(1))
     hue = np.where((rises > falls)[:, None], high, low)
@@ -110,10 +111,20 @@ def _one_side_darkened(change: np.ndarray, bell: np.ndarray) -> np.ndarray:
     return good & (hue < HUE * factor) & (np.maximum(*scatter) < np.maximum(ROUGH * factor, NOISE))
 
 
-def _two_sides(patch: np.ndarray, bell: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _step(patch: np.ndarray, bell: np.ndarray) -> np.ndarray:
+    """(n, 3) brighter less darker side of the pixels (n, m, 3)."""
+    high, low, _ = _two_sides(patch, bell)
+    more, less, above = _two_sides(patch, bell, TIP)
+    off = np.sum((patch - np.where(above[..., None], more[:, None], less[:, None])) ** 2, axis=-1)
+    scatter = np.sqrt(np.sum(bell * off, axis=1) / (3 * bell.sum()))
+    tip = scatter < CLEAN * (more - less).mean(1)
+    return np.where(tip[:, None], more - less, high - low)
+
+
+def _two_sides(patch: np.ndarray, bell: np.ndarray, least: float = SIDE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean colours (n, 3) of the brighter and the darker part of the pixels (n, m, 3), and (n, m) bool which."""
     grey = patch.mean(-1)
-    low, high = np.quantile(grey, [FEW, 1 - FEW], axis=1)
+    low, high = np.quantile(grey, [least, 1 - least], axis=1)
     above = grey > ((low + high) / 2)[:, None]
     return _mean(patch, above * bell), _mean(patch, ~above * bell), above
 
