@@ -23,8 +23,10 @@ LIT_TRACKS, LIT_SHARE = 40, 0.5
 such edges the world is grey, and they say nothing of shadows (three real clips: 68 to 76 %)."""
 HARDLY_SHADOWS, SOME_SHADOWS, SHADOWS = 0.2, 0.4, 0.75
 """Shares of the tracks that follow a joint (of all that moves, where none is found) on edges of shadows: below the
-first they do no harm; from the second on it is asked for without them (right answers on rendered clips have up to 0.33,
-wrong ones 0.35 to 1); from the third on it is a shadow's."""
+first they are left in; from the second on it is asked for without them (right answers on rendered clips have up to
+0.33, wrong ones 0.35 to 1); from the third on it is a shadow's."""
+SHARPER = 2.0
+"""How many times less a joint's tracks have to miss it by without the edges of some shadows."""
 BESIDE_PX = 10.0
 """Working px within which a track is on the shadow of which another is on the edge: the windows of both see it."""
 
@@ -43,8 +45,9 @@ def off_shadows(video: Video, tracks: Tracks) -> Tracks:
 def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[Tracks], JointFit]) -> JointFit:
     """The joint, or where many of its tracks are on shadows, what is found without these.
 
-    First it is asked for without what is seen to be the edge of one, then without all that may be on one, where that is
-    much of what still agrees; the second answer counts if it is a sure one. Where nothing is found without the edges, a
+    First it is asked for without what is seen to be the edge of one; where that is but some of it a sure answer counts
+    that its tracks follow far more exactly. Then without all that may be on one, where that is much of what still
+    agrees; the answer counts if it is a sure one. Where nothing is found without the edges, a
     joint is refused if nearly all of it are such edges or it is doubtful by itself, else ambiguous. What is found
     without them is ambiguous where nearly all of it may be on a shadow too, and refused where it is doubtful besides.
 
@@ -57,7 +60,14 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if tracks.cast is None or not len(agree) or np.mean(cast := tracks.cast[agree]) < HARDLY_SHADOWS:
         return fit
     many = np.mean(cast) >= SOME_SHADOWS
-    again = ask(_without(tracks, tracks.cast)) if many else fit
+    if refused and not many:
+        return fit
+    again = ask(_without(tracks, tracks.cast))
+    if not many:
+        before, after = fit.residual_px, again.residual_px
+        if again.verdict == "ok" and before and after and SHARPER * after < before:
+            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+        again = fit
     if again.verdict != "refused":
         may = maybe_shadows(video, tracks)
         share = np.mean(may[again.point_track])
