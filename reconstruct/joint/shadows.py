@@ -48,11 +48,13 @@ def off_shadows(video: Video, tracks: Tracks) -> Tracks:
 def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[Tracks], JointFit]) -> JointFit:
     """The joint, or where many of its tracks are on shadows, what is found without these.
 
-    First it is asked for without what is seen to be the edge of one; where that is but some of it a sure answer counts
+    First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
     that its tracks follow far more exactly. Then without all that may be on one, where that is much of what still
-    agrees and the world is not grey; a sure answer counts that its tracks follow no less exactly. Where nothing is found
-    without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by itself, else ambiguous. What is found
-    without them is ambiguous where nearly all of it may be on a shadow too, and refused where it is doubtful besides.
+    agrees; a sure answer counts that its tracks follow no less exactly. In a grey world only many edges are asked of.
+
+    Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
+    itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
+    refused where it is doubtful besides.
 
     Args:
         fit: the joint of all these tracks, or a refusal.
@@ -63,7 +65,7 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if tracks.cast is None or not len(agree) or np.mean(cast := tracks.cast[agree]) < HARDLY_SHADOWS:
         return fit
     many = np.mean(cast) >= SOME_SHADOWS
-    if refused and not many:
+    if not many and (refused or _grey(tracks)):
         return fit
     again = ask(_without(tracks, tracks.cast))
     if not many:
