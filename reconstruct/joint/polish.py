@@ -292,10 +292,11 @@ def frames_held(s: Sightings, w: np.ndarray) -> np.ndarray:
     Where a tracker has lost everything a state may run off for nothing: in units of its own path it would not be bent,
     and of a hinge that is far away it would be what makes it near.
     """
-    near = w > 0.25 * s.weight[:, None]
+    # Trackers that measure what the picture holds drop what they have lost: what they show they hold.
+    near = w > 0.25 * s.weight[:, None] if s.slip is None else s.seen
     if s.link is not None:
         near = near[s.link]
-    held = np.flatnonzero(near.sum(0) >= HOLDERS)
+    held = np.flatnonzero(near.sum(0) >= (HOLDERS if s.slip is None else 1))
     return held if len(held) > 1 else np.arange(len(near[0]))
 
 
