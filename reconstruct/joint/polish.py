@@ -287,16 +287,16 @@ class _Priors:
 
 
 def frames_held(s: Sightings, w: np.ndarray) -> np.ndarray:
-    """(k,) frames whose state tracks hold, by the robust loss's weights (N, T); all of them where these are too few.
+    """(k,) frames whose state tracks hold: by the robust loss's weights (N, T), or with slip wherever they are seen, as
+    such tracks end where they are lost; all of them where these are too few.
 
     Where a tracker has lost everything a state may run off for nothing: in units of its own path it would not be bent,
     and of a hinge that is far away it would be what makes it near.
     """
-    # Trackers that measure what the picture holds drop what they have lost: what they show they hold.
-    near = w > 0.25 * s.weight[:, None] if s.slip is None else s.seen
+    near, least = (w > 0.25 * s.weight[:, None], HOLDERS) if s.slip is None else (s.seen, 1)
     if s.link is not None:
         near = near[s.link]
-    held = np.flatnonzero(near.sum(0) >= (HOLDERS if s.slip is None else 1))
+    held = np.flatnonzero(near.sum(0) >= least)
     return held if len(held) > 1 else np.arange(len(near[0]))
 
 
