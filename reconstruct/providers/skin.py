@@ -9,6 +9,8 @@ bracelets and sleeves belong to the arm too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from reconstruct.cues import HandTrack
@@ -20,6 +22,9 @@ PALM = (0, 1, 5, 9, 13, 17)
 FINGERS = ((1, 2, 3, 4), (5, 6, 7, 8), (9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
 SURE_SCORE = 0.85  # landmarks at least this confident teach the skin colour
 GAP_SECONDS = 1.0  # without landmarks a hand is carried on for at most this long, unless it stays at the border
+SLEEVE = 0.5  # of what is seen behind the bare arm has to be of colours that are seen less elsewhere
+CLEARLY = 3.0  # logarithm of how much likelier a colour is on the hand: parts that hide fingers are taught as skin too
+ELSEWHERE = 0.2  # of the hands' area may be skin coloured elsewhere for colour alone to tell them
 CHANGED = 14.0  # YCrCb distance from the background that counts as something else being there
 
 
@@ -140,21 +145,31 @@ def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
             if x.valid[t] and x.score[t] >= SURE_SCORE:
                 inside = _draw_hand(shape, (video.to_work(x.uv[t]) + 0.5) * k - 0.5, 0.12).astype(bool)
                 skin += np.bincount(_bins(ycc[t][inside]), minlength=len(skin))
-        if t % 4 == 0:
+        # Where no hand was found one may be all the same.
+        if hands[t]:
             rest += np.bincount(_bins(ycc[t][(near[t] | arm[t]) == 0]), minlength=len(rest))
     if not skin.any():
         return out
-    is_skin = _log_density(skin) - _log_density(rest) > 0.0
+    odds = _log_density(skin) - _log_density(rest)
+    is_skin, is_clearly = odds > 0.0, odds > CLEARLY
     background, known = _background(ycc, near | arm)
+
+    alone = _tells_alone(is_clearly, ycc, near, arm, hands)
+
+    def differing(t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What is not known to be background; what is known to be new; the same without mere shadows."""
+        difference = ycc[t] - background
+        changed = np.linalg.norm(difference, axis=-1) > CHANGED
+        other_hue = np.linalg.norm(difference[..., 1:], axis=-1) > 6.0
+        new = known & changed
+        return changed | ~known, new, new & (other_hue | (difference[..., 0] < -50.0))
 
     def candidates(t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Skin that is not known to be background; skin known to be new; anything new that is no mere shadow."""
         colour = is_skin[_bins(ycc[t])]
-        difference = ycc[t] - background
-        changed = np.linalg.norm(difference, axis=-1) > CHANGED
-        other_hue = np.linalg.norm(difference[..., 1:], axis=-1) > 6.0
-        solid = known & changed & (other_hue | (difference[..., 0] < -50.0))
-        return colour & (changed | ~known), colour & changed & known, solid
+        loose, new, solid = differing(t)
+        skin = is_clearly[_bins(ycc[t])] & alone
+        return (colour & loose) | skin, (colour & new) | skin, solid
 
     masks = np.zeros((n, *shape), np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
@@ -171,6 +186,9 @@ def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
         allowed = np.maximum(allowed, cv2.morphologyEx(allowed, cv2.MORPH_CLOSE, bridge) & arm[t])
         mask = _connected(allowed | seed, seed).astype(np.uint8)
         masks[t] = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)
+    _add_sleeves(masks, hands, arm, known, ycc, rest, differing)
+    if alone:
+        _add_tips(masks, hands, lambda t: is_clearly[_bins(ycc[t])])
     _carry_on(masks, hands, candidates, video.time, kernel)
     grow = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     for t in range(n):
@@ -178,6 +196,104 @@ def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
             big = cv2.resize(cv2.dilate(masks[t], grow), (width, height), interpolation=cv2.INTER_NEAREST)
             out[t] = big.astype(bool)
     return out
+
+
+def _tells_alone(is_skin: np.ndarray, ycc: np.ndarray, near: np.ndarray, arm: np.ndarray, hands: list) -> bool:
+    """Whether nothing but hands and arms is skin coloured in this clip, so that colour alone tells them.
+
+    A hand
+    A hand that rests, or hardly moves, is the only background that is ever seen there.
+    """
+    import cv2
+
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    hand = elsewhere = 0
+    for t in np.flatnonzero([len(h) > 0 for h in hands]):
+        colour = is_skin[_bins(ycc[t])]
+        hand += int((colour & (near[t] > 0)).sum())
+        away = colour & ((near[t] | arm[t]) == 0)
+        elsewhere += int(cv2.morphologyEx(away.astype(np.uint8), cv2.MORPH_OPEN, kernel).sum())
+    return elsewhere <= ELSEWHERE * hand
+
+
+def _arm_end(mask: np.ndarray, cone: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Wrist, direction in which the arm goes on, and how far along that it is in the mask, px."""
+    size = _palm_size(uv)
+    knuckles = uv[[5, 9, 13, 17]].mean(0)
+    back = (uv[0] - knuckles) / max(np.linalg.norm(uv[0] - knuckles), 1e-6)
+    v, u = np.nonzero(mask & cone)
+    away = np.stack([u, v], axis=-1) - uv[0]
+    if not len(away):
+        return uv[0], back, 0.0
+    far = np.linalg.norm(away, axis=1)
+    tip = away[far >= np.quantile(far, 0.9)].mean(0)
+    if np.linalg.norm(tip) > 0.5 * size:
+        back = tip / np.linalg.norm(tip)
+    return uv[0], back, float(max(np.quantile(away @ back, 0.98), 0.0))
+
+
+def _add_sleeves(masks: np.ndarray, hands: list, arm: np.ndarray, known: np.ndarray, ycc: np.ndarray,
+                 rest: np.ndarray, candidates: Callable) -> None:  # fmt: skip
+    """Sleeves where no background was ever seen: this clip's colours behind the bare arm, as far as the picture's rim.
+
+    Args:
+        rest: histogram of the colours that are seen where no hand or arm can be.
+        candidates: of a frame, (h, w) bool each: what is not known to be background, what is new, what is no shadow.
+    """
+    import cv2
+
+    shape = masks.shape[1:]
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    rim = np.zeros(shape, bool)
+    rim[[0, -1]] = rim[:, [0, -1]] = True
+    sleeve = np.zeros(np.prod(BINS))
+    for t, mask in enumerate(masks > 0):
+        for uv in hands[t]:
+            cone = _forearm(shape, uv) > 0
+            if not mask.any() or (mask & cone & rim).any():
+                continue
+            wrist, back, end = _arm_end(mask, cone, uv)
+            along = (u - wrist[0]) * back[0] + (v - wrist[1]) * back[1]
+            beside = np.abs((u - wrist[0]) * back[1] - (v - wrist[1]) * back[0])
+            size = _palm_size(uv)
+            behind = cone & ~mask & (along > end - 0.1 * size) & (along < end + 0.6 * size) & (beside < 0.35 * size)
+            sleeve += np.bincount(_bins(ycc[t][behind & ~known]), minlength=len(sleeve))
+    if not sleeve.any():
+        return
+    is_sleeve = _log_density(sleeve) - _log_density(rest) > 0.0
+    if sleeve[is_sleeve].sum() < SLEEVE * sleeve.sum():
+        return
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    bridge = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11))
+    for t in range(len(masks)):
+        if not masks[t].any():
+            continue
+        loose, _, solid = candidates(t)
+        new = (((is_sleeve[_bins(ycc[t])] & loose) | solid) & (arm[t] > 0)).astype(np.uint8)
+        new = cv2.morphologyEx(cv2.morphologyEx(new, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, bridge) & arm[t]
+        grown = _at_border(_connected(new, cv2.dilate(masks[t], bridge)))
+        both = masks[t] | grown.astype(np.uint8)
+        masks[t] |= cv2.morphologyEx(both, cv2.MORPH_CLOSE, bridge) & (arm[t] | masks[t])
+
+
+def _add_tips(masks: np.ndarray, hands: list, colour: Callable[[int], np.ndarray]) -> None:
+    """Fingers that come in over the picture's rim beside a hand that reaches out of it: small skin-coloured patches."""
+    import cv2
+
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    for t in range(len(masks)):
+        if not _at_border(masks[t]).any():
+            continue
+        for uv in hands[t]:
+            size = _palm_size(uv)
+            reach = np.zeros(masks[t].shape, np.uint8)
+            hull = cv2.convexHull(np.round(uv).astype(np.int32))
+            cv2.fillConvexPoly(reach, hull, 1)
+            cv2.polylines(reach, [hull], True, 1, max(1, round(3.0 * size)))
+            around = cv2.dilate(masks[t], kernel, iterations=3) > 0
+            skin = cv2.morphologyEx((colour(t) & ~around).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+            patches = _at_border(skin) & ~_large(skin > 0, 0.5 * size**2)
+            masks[t] |= _connected(patches, reach).astype(np.uint8)
 
 
 def _carry_on(masks: np.ndarray, hands: list, candidates, time: np.ndarray, kernel: np.ndarray) -> None:
