@@ -12,11 +12,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.groups import MIN_GROUP, Rigid
-from reconstruct.joint.polish import Bundle
-from reconstruct.joint.twist import Twist, twist_of_joint
+from reconstruct.joint.paths import held
+from reconstruct.joint.polish import ROBUST_SIGMAS, Bundle, Sightings, positions, residuals, robust_loss
+from reconstruct.joint.twist import Twist, skew, twist_of_joint
 
 STILL_SHARE = 0.15
 """A camera moves if fewer tracks than this share stay where they are."""
+DEGREE = 4
+"""Of the polynomials that a smooth path follows."""
+TELLS = 5.0
+"""Log-likelihood by which a path has to be smoother to be the one before the scene."""
 
 
 def camera_moves(uv: np.ndarray, diagonal: float) -> bool:
@@ -29,28 +34,85 @@ def camera_moves(uv: np.ndarray, diagonal: float) -> bool:
     return bool(np.mean(np.linalg.norm(high - low, axis=-1) < 0.004 * diagonal) < STILL_SHARE)
 
 
-def rougher(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
-            degree: int = 4) -> bool:  # fmt: skip
-    """True if the second of two camera paths (R, t), body to camera, is the rougher one.
+def smoother_before_the_link(b: Bundle, s: Sightings) -> bool:
+    """True if the camera's path before the link is clearly smoother than that before the scene.
 
     A path is six numbers a frame: where a point of the body is in the picture, the logarithm of its depth, and the
     turn. Roughness is what polynomials in time leave of them (an arc of a circle needs no more than the fourth degree),
-    each over its noise, which differs much: the place in the picture is known far better than the camera's.
+    as the tracks see it: squared residuals over their noise by which they contradict that smooth path, with the states
+    free. Numbers alone do not tell: a step to the side and a turn look nearly alike, and each of the two is known far
+    worse than what they do together.
 
     Args:
-        centre: (3,) the point, in the frame that both bodies share in the first picture.
+        b: the fitted joint with the camera's path.  s: its sightings of link and scene.
     """
-    left, jitter = [], []
-    for R, t in (one, other):
-        T = len(R)
+    assert b.R is not None and b.t is not None
+    frames = np.arange(len(b.q)) if s.frames is None else s.frames
+    time = np.interp(frames, [frames[0], frames[-1]], [-1.0, 1.0])
+    basis = np.polynomial.legendre.legvander(time, min(DEGREE, len(time) - 2))
+    H, by_state = _information(b, s)
+    left = []
+    # The camera before the link goes along with the state: what holds both is written in the one or in the other.
+    for path, along in (((b.R, b.t), 0.0), (before_the_link(b.twist, b.q, b.R, b.t), by_state)):
+        change = np.tile(np.eye(7), (len(b.q), 1, 1))
+        change[:, :6, 6] -= along
+        both = np.swapaxes(change, 1, 2) @ H @ change
+        alone = both[:, :6, :6] - both[:, :6, 6:] * both[:, 6:, :6] / (both[:, 6:, 6:] + 1e-12)
+        chart, slope = _chart(*path, b.twist.anchor)
+        inverse = np.linalg.inv(slope)
+        weight = np.swapaxes(inverse, 1, 2) @ alone @ inverse
+        left.append(_left_over(chart, weight, basis))
+    return left[0] - left[1] > 2 * TELLS
+
+
+def _information(b: Bundle, s: Sightings) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 7, 7) of the camera's small turn and step and the state, in every frame, the points given; and (T, 6) the
+    turn and step of the camera before the resting link that a unit of the state amounts to."""
+    world, cam = positions(b, s)
+    assert b.R is not None and b.t is not None and s.link is not None
+    scale = ROBUST_SIGMAS * b.sigma
+    w = robust_loss(residuals(b, s, cam), s, scale)[1] / b.sigma**2
+    z = np.maximum(cam[..., 2], 1e-3)
+    by_point = np.zeros((*cam.shape[:2], 2, 3))
+    by_point[..., 0, 0] = by_point[..., 1, 1] = s.focal * np.exp(b.log_focal) / z
+    by_point[..., 2] = -by_point[..., 0, :1] * cam[..., :2] / z[..., None]
+    # The link's points go along by w x (x - g) + d, which is a turn w and a step d - w x g of the world they are in.
+    turn = np.einsum("tij,j->ti", b.R, b.twist.curvature)
+    step = np.einsum("tij,j->ti", b.R, b.twist.direction - np.cross(b.twist.curvature, b.twist.anchor))
+    step += np.cross(b.t, turn)
+    J = np.zeros((*cam.shape[:2], 2, 7))
+    J[..., :3] = -by_point @ skew(cam)
+    J[..., 3:6] = by_point
+    along = np.concatenate([turn, step], axis=1)
+    J[..., 6] = np.where(s.link[:, None, None], np.einsum("ntij,tj->nti", J[..., :6], along), 0.0)
+    J = np.stack([held(J[..., k], s.slip) for k in range(7)], axis=-1)
+    return np.einsum("nt,ntia,ntib->tab", w, J, J), along
+
+
+def _chart(R: np.ndarray, t: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 6) of a path, and its derivatives (T, 6, 6) by a small turn and step of the camera."""
+
+    def numbers(R: np.ndarray, t: np.ndarray) -> np.ndarray:
         p = R @ centre + t
-        turn = Rotation.from_matrix(R[T // 2].T @ R).as_rotvec()
-        path = np.concatenate([p[:, :2] / p[:, 2:], np.log(np.maximum(p[:, 2:], 1e-6)), turn], axis=1)
-        basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, T), degree)
-        left.append(np.mean((path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]) ** 2, axis=0))
-        jitter.append(np.mean(np.diff(path, 3, axis=0) ** 2, axis=0) / 20)  # white noise grows by 1 + 9 + 9 + 1
-    noise = np.minimum(*jitter) + 1e-18
-    return bool(np.sum(left[1] / noise) > np.sum(left[0] / noise))
+        turn = Rotation.from_matrix(middle.T @ R).as_rotvec()
+        return np.concatenate([p[:, :2] / p[:, 2:], np.log(np.maximum(p[:, 2:], 1e-6)), turn], axis=1)
+
+    middle, h = R[len(R) // 2], 1e-6
+    here, slope = numbers(R, t), np.zeros((len(R), 6, 6))
+    for k in range(6):
+        small = h * np.eye(6)[k]
+        turned = Rotation.from_rotvec(small[:3]).as_matrix()
+        slope[..., k] = (numbers(turned @ R, t @ turned.T + small[3:]) - here) / h
+    return here, slope
+
+
+def _left_over(path: np.ndarray, weight: np.ndarray, basis: np.ndarray) -> float:
+    """Weighted squares that the best combination of the basis (T, D) leaves of a path (T, K) with weights (T, K, K)."""
+    K, D = path.shape[1], basis.shape[1]
+    A = np.einsum("td,te,tij->diej", basis, basis, weight).reshape(D * K, D * K)
+    y = np.einsum("td,tij,tj->di", basis, weight, path).reshape(-1)
+    off = path - basis @ np.linalg.lstsq(A, y, rcond=1e-12)[0].reshape(D, K)
+    return float(np.einsum("ti,tij,tj->", off, weight, off))
 
 
 def before_the_link(twist: Twist, q: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

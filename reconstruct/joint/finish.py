@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import expit
 
 from reconstruct.joint.bundle import Observations, State, transport
-from reconstruct.joint.cameras import before_the_link, rougher
+from reconstruct.joint.cameras import before_the_link, smoother_before_the_link
 from reconstruct.joint.halves import halves, widened
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities, tempered, votes
 from reconstruct.joint.paths import Paths, held
@@ -402,8 +402,8 @@ def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, paths: 
                    still: Still | None, view: View):  # fmt: skip
     """From the first round's frames to all, before the camera found so far: the link alone, its tracks, scene and view.
 
-    Before a moving camera link and scene change places where the path before the link is the smoother one. That is the
-    same joint run backwards.
+    Before a moving camera link and scene change places where the path before the link is clearly the smoother one. That
+    is the same joint run backwards.
     """
     every = view if still is None else view.corrected(best[kind], sight.frames)
     link = np.ones(len(sight.uv), bool) if sight.link is None else sight.link
@@ -414,7 +414,7 @@ def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, paths: 
     if still is None or still.known or every.R is None or every.t is None:
         return out, members, still, every
     b = best[kind]
-    if b.R is None or b.t is None or rougher((b.R, b.t), before_the_link(b.twist, b.q, b.R, b.t), b.twist.anchor):
+    if b.R is None or b.t is None or not smoother_before_the_link(b, sight):
         return out, members, still, every
     path = before_the_link(out[kind].twist, out[kind].q, every.R, every.t)
     others = still.ids[_spread_out(len(still.ids), MOST_STILL)]

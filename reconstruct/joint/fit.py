@@ -432,8 +432,19 @@ def _moving_camera(video: Video, paths: Paths, view: View, full_focal: float, se
             return fit
         asked &= ~min(bodies, key=lambda body: body.members.sum()).members
     if asked.all():
-        return None
+        return _of_one_body(video, paths, view, full_focal, seed)
     return JointFit("refused", NO_STROKE, tracks=len(paths))
+
+
+def _of_one_body(video: Video, paths: Paths, view: View, full_focal: float, seed: int) -> JointFit | None:
+    """The joint between two bodies that move so little against each other that all tracks fit one, or None.
+
+    Arguments as of _moving_camera.
+    """
+    if (bodies := two_bodies(paths.uv, view.focal, seed, split=True)) is None:
+        return None
+    fit, stroke = _between(*bodies, video, paths, view, full_focal)
+    return fit if fit.verdict != "refused" and stroke > STROKE_STDS else None
 
 
 def _between(static: Rigid, link: Rigid, video: Video, paths: Paths, view: View, full_focal: float

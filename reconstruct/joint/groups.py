@@ -36,6 +36,15 @@ SLOW, SLOW_WINDOWS = 4.0, 5
 that noise would leave. A second body that turns slowly against the first can be fitted to a pixel, not to its mean."""
 
 
+CLEAR = 10.0
+"""Log-likelihood by which a track has to prefer one of two bodies' paths to be held against it."""
+ROUNDS = 20
+WORST = 0.4
+"""Share of a body's tracks among which a second body is looked for where it holds tracks of both."""
+LOSS_SIGMAS = 4.0
+"""Scale of a track's loss, in standard deviations of the noise."""
+
+
 @dataclass(frozen=True)
 class Rigid:
     """A rigid body and the camera's path about it.
@@ -57,34 +66,67 @@ class Rigid:
     shown: np.ndarray
 
 
-def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | None = None
+def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | None = None, split: bool = False
                ) -> tuple[Rigid, Rigid] | None:  # fmt: skip
     """The two largest rigid groups, every track with the one that it fits better; None if there are none.
 
-    The first is the one that is in sight for longer, of two in sight alike the larger one.
+    The first is the one that is in sight for longer, of two in sight alike the larger one. Where the motion is small
+    the first group found holds tracks of both bodies: what clearly fits one path better than the other is held against
+    it alone, until no track changes sides (as the EM algorithm does; Dempster, Laird and Rubin, 1977).
 
     Args:
         uv: (N, T, 2) px from the principal point, NaN where not seen.  focal: px.
         asked: (N,) bool, tracks that may be in them; all when None.
+        split: look for the second among the tracks that the first one's motion fits worst, however well, rather than
+            among those that it does not fit.
     """
     asked = np.ones(len(uv), bool) if asked is None else asked
     one = rigid_group(uv, focal, asked, seed)
     if one is None:
         return None
-    other = rigid_group(uv, focal, asked & ~one.members, seed)
+    other = rigid_group(uv, focal, _fitting_worst(uv / focal, one, focal) if split else asked & ~one.members, seed)
     if other is None:
         return None
-    for _ in range(2):
-        # What fits both (short tracks, points near the hinge) is not asked.
-        clear = 0.7
-        mine, theirs = one.cost < clear * other.cost, other.cost < clear * one.cost
-        if min((one.members & mine).sum(), (other.members & theirs).sum()) < MIN_GROUP:
-            break
-        one, other = regrown(uv, focal, one, mine), regrown(uv, focal, other, theirs)
+    if (apart := _told_apart(uv, focal, one, other, asked)) is None and split:
+        return None
+    one, other = apart or (one, other)
+    # Begun from tracks of both, a body's path may have come to rest beside its optimum: searched again from its own.
+    again = _larger(rigid_group(uv, focal, asked & ~other.members, seed), one)
+    others = _larger(rigid_group(uv, focal, asked & ~one.members, seed), other)
+    if again is not one or others is not other:
+        one, other = _told_apart(uv, focal, again, others, asked) or (again, others)
     if one.shown.sum() < other.shown.sum():
         # Of a scene the camera's path is asked in every frame, a link may be out of sight for a while.
         return other, one
     return one, other
+
+
+def _larger(new: Rigid | None, old: Rigid) -> Rigid:
+    return old if new is None or new.members.sum() <= old.members.sum() else new
+
+
+def _told_apart(uv: np.ndarray, focal: float, one: Rigid, other: Rigid, asked: np.ndarray
+                ) -> tuple[Rigid, Rigid] | None:  # fmt: skip
+    """Two bodies held against the tracks that clearly fit the one better than the other; None if these are too few."""
+    count = np.isfinite(uv[..., 0]).sum(1)
+    told = None
+    for _ in range(ROUNDS):
+        # What fits both (short tracks, points near the hinge) is not asked.
+        better = 0.5 * LOSS_SIGMAS**2 * count * (other.cost - one.cost)
+        mine, theirs = asked & (better > CLEAR), asked & (better < -CLEAR)
+        if min((one.members & mine).sum(), (other.members & theirs).sum()) < MIN_GROUP:
+            break
+        before, told = told, (regrown(uv, focal, one, mine), regrown(uv, focal, other, theirs))
+        one, other = told
+        if before and all(np.array_equal(a.members, b.members) for a, b in zip(before, told, strict=True)):
+            break
+    return told
+
+
+def _fitting_worst(x: np.ndarray, body: Rigid, focal: float) -> np.ndarray:
+    """(N,) bool, the members whose residuals last longest; x: rays."""
+    slow = _slow(x, np.isfinite(x[..., 0]), body.R, body.t, body.X, focal, max(body.sigma, 0.1))
+    return body.members & (slow >= np.quantile(slow[body.members], 1 - WORST))
 
 
 def rigid_group(uv: np.ndarray, focal: float, candidates: np.ndarray, seed: int = 0) -> Rigid | None:
@@ -368,7 +410,7 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     unit = float(np.median(X[members, 2]))
     if unit <= 0:
         return None
-    cost = _track_cost(x, seen, R, t, X, focal, 4 * max(sigma, 0.25))
+    cost = _track_cost(x, seen, R, t, X, focal, LOSS_SIGMAS * max(sigma, 0.25))
     shown = seen[members].sum(0) >= POSE_HOLDERS
     if shown.sum() < 2:
         return None

@@ -1,5 +1,6 @@
 """A camera that moves: found from the static scene, and together with the joint."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import ProviderInfo, Tracks
-from reconstruct.joint.cameras import before_the_link, camera_moves, joints_between, rougher
+from reconstruct.joint.cameras import before_the_link, camera_moves, joints_between, smoother_before_the_link
 from reconstruct.joint.fit import fit_joint
-from reconstruct.joint.groups import Rigid, between, rigid_group
+from reconstruct.joint.groups import Rigid, between, rigid_group, two_bodies
 from reconstruct.joint.models import joint_transform
-from reconstruct.joint.polish import Bundle, Sightings, regauged, residuals
+from reconstruct.joint.polish import Bundle, Sightings, polish, regauged, residuals
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.video import Video
 from tests.reconstruct.joint_scenes import FOCAL, H, W, project
@@ -46,6 +47,30 @@ def test_cameras_are_recovered_from_the_static_points():
     assert np.degrees(errors).max() < 0.3
 
 
+def test_bodies_that_hardly_move_against_each_other_are_told_apart():
+    """A lid that turns by 10 deg before a camera that goes round: with the base it fits one body to 0.54 px."""
+    rng = np.random.default_rng(2)
+    base = np.column_stack([rng.uniform(-0.4, 0.4, 60), np.full(60, 0.3), rng.uniform(1.6, 2.2, 60)])
+    lid = np.column_stack([rng.uniform(-0.4, 0.4, 150), rng.uniform(-0.3, 0.29, 150), np.full(150, 2.2)])
+    s = np.clip((np.arange(60) - 5) / 50, 0, 1)
+    T = joint_transform("revolute", np.array([1.0, 0, 0]), np.array([0, 0.3, 2.2]), 0.17 * (3 * s**2 - 2 * s**3))
+    world = np.concatenate([np.repeat(base[:, None], 60, axis=1),
+                            np.einsum("tij,nj->nti", T[:, :3, :3], lid) + T[:, :3, 3]])  # fmt: skip
+    orbit = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(25), 60), [0, 1, 0]))
+    look = (Rotation.from_rotvec([0.4, 0, 0]) * orbit).as_matrix()
+    centre = np.array([0, 0, 1.9])
+    uv = project(np.einsum("tij,ntj->nti", look, world - centre) + centre)
+    uv = uv + rng.normal(scale=0.5, size=uv.shape) - [(W - 1) / 2, (H - 1) / 2]
+    assert two_bodies(uv, FOCAL) is None
+    bodies = two_bodies(uv, FOCAL, split=True)
+    assert bodies is not None
+    still, moving = sorted((b.members for b in bodies), key=lambda m: m[60:].sum())
+    assert still[:60].mean() > 0.8 and still[60:].mean() < 0.1
+    assert moving[60:].mean() > 0.6 and moving[:60].mean() < 0.05
+    # Nor is one body two.
+    assert two_bodies(uv[:60], FOCAL, split=True) is None
+
+
 def test_a_static_camera_is_not_taken_for_a_moving_one():
     rng = np.random.default_rng(1)
     uv = np.repeat(rng.uniform(50, 500, (80, 1, 2)), 30, axis=1) + rng.normal(scale=0.3, size=(80, 30, 2))
@@ -67,22 +92,44 @@ def test_a_plate_is_a_body_too():
     assert np.degrees(Rotation.from_matrix(group.R @ np.swapaxes(turn, 1, 2)).magnitude()).max() < 2.0
 
 
-def test_the_body_before_which_the_camera_moves_smoothly_rests():
+def test_the_link_s_points_are_where_either_path_has_them():
     turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(40), 60), [0, 1, 0])).as_matrix()
     centre = np.array([0, 0, 1.9])
     t = centre - turn @ centre
     twist, speed = twist_of_joint("revolute", AXIS, POINT, POINT + [0.3, 0.0, 0.0])
-    s = np.clip((np.arange(60) - 20) / 20, 0, 1)
-    link = before_the_link(twist, 0.5 * speed * s, turn, t)
-    assert rougher((turn, t), link, twist.anchor)
-    assert not rougher(link, (turn, t), twist.anchor)
-    # The link's points in the picture, by way of its own path and by way of the scene's.
+    q = 0.5 * speed * np.clip((np.arange(60) - 20) / 20, 0, 1)
+    link = before_the_link(twist, q, turn, t)
     x = np.array([[0.1, 0.2, 1.8]])
-    R, p = twist.pose(0.5 * speed * s)
+    R, p = twist.pose(q)
     world = twist.anchor + (x - twist.anchor) @ np.swapaxes(R, 1, 2) + p[:, None]
     np.testing.assert_allclose(
         world @ np.swapaxes(turn, 1, 2) + t[:, None], x @ np.swapaxes(link[0], 1, 2) + link[1][:, None], atol=1e-9
     )
+
+
+@pytest.mark.parametrize("stroke", [0.01, 0.3])
+def test_the_body_before_which_the_camera_moves_smoothly_rests(stroke):
+    """Steps of a few pixels, too, though each frame's turn and step are known far worse."""
+    rng = np.random.default_rng(5)
+    still = rng.uniform([-0.5, -0.4, 1.5], [0.5, 0.4, 2.3], (60, 3))
+    knob = rng.uniform([-0.1, -0.1, 1.7], [0.1, 0.1, 1.8], (120, 3))
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(30), 50), [0, 1, 0])).as_matrix()
+    centre = np.array([0, 0, 1.9])
+    t = centre - turn @ centre
+    q = stroke * np.clip((np.arange(50) - 15) / 12, 0, 1)
+    twist = Twist(knob.mean(0), np.array([0.6, 0.8, 0.0]), np.zeros(3))
+    X = np.concatenate([knob, still])
+    like = Sightings(np.zeros((180, 50, 2)), np.ones((180, 50), bool), np.ones(180), FOCAL, link=np.arange(180) < 120,
+                     free=True, frames=np.arange(50))  # fmt: skip
+    truth = Bundle("prismatic", twist, q, X, sigma=0.5, R=turn, t=t)
+    uv = residuals(truth, like) + rng.normal(scale=0.5, size=(180, 50, 2))
+    # As it is fitted: each frame's camera and state are off as far as the noise allows.
+    fitted = polish(truth, replace(like, uv=uv))
+    assert not smoother_before_the_link(fitted, replace(like, uv=uv))
+    # The same with link and scene in each other's place.
+    R, t = before_the_link(fitted.twist, fitted.q, fitted.R, fitted.t)
+    swapped = replace(fitted, q=-fitted.q, R=R, t=t)
+    assert smoother_before_the_link(swapped, replace(like, uv=uv, link=~like.link))
 
 
 def filmed(uv):
