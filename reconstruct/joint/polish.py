@@ -218,7 +218,8 @@ class _Priors:
         bend: (T, T) of q's second differences.
         radius, log_turn: weight of a hinge's radius, and the logarithm of the turn that the path at hand is expected to
             be; 0 for a slide.
-        far: the frame with the longest path of those that tracks hold.
+        ends: the frames with the least and the most path of those that tracks hold. Measured from the first frame,
+            which may show nothing of the link, a hinge would get its radius by a path that nothing contradicts.
         reach: of the link's points.
     """
 
@@ -226,7 +227,7 @@ class _Priors:
     bend: np.ndarray
     radius: float
     log_turn: float
-    far: int
+    ends: tuple[int, int]
     reach: Reach
 
     @classmethod
@@ -246,14 +247,14 @@ class _Priors:
         focal = sigma**2 * s.lasting / s.focal_std**2 if s.focal_std > 0 else 0.0
         held = frames_held(s, w)
         bend = s.bend * (sigma / (BEND * max(float(np.ptp(b.q[held])), 1e-9))) ** 2
-        far = int(held[np.argmax(np.abs(b.q[held]))])
-        path = abs(float(b.q[far]))
+        ends = int(held[np.argmin(b.q[held])]), int(held[np.argmax(b.q[held])])
+        path = float(b.q[ends[1]] - b.q[ends[0]])
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
         reach = Reach.of(b, s, sigma)
         if b.kind == "prismatic" or s.link is not None or path <= 0 or size <= 0:
-            return cls(focal, bend, 0.0, 0.0, far, reach)
+            return cls(focal, bend, 0.0, 0.0, ends, reach)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
-        return cls(focal, bend, radius, float(np.log(path / (HINGE_RADIUS * size))), far, reach)
+        return cls(focal, bend, radius, float(np.log(path / (HINGE_RADIUS * size))), ends, reach)
 
     def cost(self, b: Bundle) -> float:
         """Without the radius, which is weighed apart where types are compared."""
@@ -265,7 +266,10 @@ class _Priors:
 
     def turn(self, b: Bundle) -> float:
         """Its logarithm."""
-        return float(np.log(max(np.linalg.norm(b.twist.curvature) * abs(b.q[self.far]), 1e-9)))
+        return float(np.log(max(np.linalg.norm(b.twist.curvature) * self._path(b), 1e-9)))
+
+    def _path(self, b: Bundle) -> float:
+        return float(b.q[self.ends[1]] - b.q[self.ends[0]])
 
     def add(self, n: Normal, b: Bundle) -> None:
         """Into the normal equations."""
@@ -281,7 +285,8 @@ class _Priors:
         k2 = float(b.twist.curvature @ b.twist.curvature)
         if self.radius and k2 > 0:
             row = np.zeros(len(n.g))
-            row[:G], row[A + self.far] = n.Z[3:].T @ b.twist.curvature / k2, 1 / b.q[self.far]
+            row[:G] = n.Z[3:].T @ b.twist.curvature / k2
+            row[A + self.ends[0]], row[A + self.ends[1]] = np.array([-1, 1]) / self._path(b)
             n.H[...] += self.radius * np.outer(row, row)
             n.g[...] += self.radius * (self.turn(b) - self.log_turn) * row
 
