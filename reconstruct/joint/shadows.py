@@ -30,6 +30,10 @@ GREY = 0.5
 nothing of shadows (rendered clips: 0.11 to 0.36; a steel dishwasher in a white kitchen: 0.71)."""
 SHARPER = 2.0
 """How many times less a joint's tracks have to miss it by without the edges of some shadows."""
+FEW = 0.25
+"""Of the tracks that follow a joint, the share that another has to be followed by to be the more exact one."""
+APART_STDS = 2.0
+"""Standard deviations of their axes by which two joints contradict each other."""
 BESIDE_PX = 10.0
 """Working px within which a track is on the shadow of which another is on the edge: the windows of both see it."""
 
@@ -71,16 +75,19 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if not many:
         if _sharper(again, fit, SHARPER):
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+        if _contradicts(again, fit):
+            return _most_exact(fit, again, again)
         again = fit
     if again.verdict != "refused":
         may = maybe_shadows(video, tracks)
         share = 0.0 if _grey(tracks) else np.mean(may[again.point_track])
-        if share >= SOME_SHADOWS and _sharper(lit := ask(_without(tracks, may)), again):
+        lit = ask(_without(tracks, may)) if share >= SOME_SHADOWS or (many and _doubtful(again)) else again
+        if share >= SOME_SHADOWS and _sharper(lit, again):
             return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
         if not many:
             return fit
         if share < SHADOWS:
-            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+            return _most_exact(fit, again, lit)
         words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
         if again.verdict != "ok":
             return _refuse(again, f"{words}, and {_first(again.reason)}")
@@ -121,6 +128,36 @@ def _sharper(joint: JointFit, than: JointFit, times: float = 1.0) -> bool:
     """Whether a joint is sure, and its tracks miss it so many times less."""
     after, before = joint.residual_px, than.residual_px
     return joint.verdict == "ok" and after is not None and before is not None and times * after <= before
+
+
+def _doubtful(joint: JointFit) -> bool:
+    return joint.verdict == "ambiguous"
+
+
+def _contradicts(one: JointFit, other: JointFit) -> bool:
+    """Whether two joints are of different types, or their axes further apart than both say they may be."""
+    if "refused" in (one.verdict, other.verdict):
+        return False
+    if one.type != other.type:
+        return True
+    if one.axis is None or other.axis is None or one.std is None or other.std is None:
+        return False
+    axes = [x.axis @ x.T_camera_world[:3, :3].T for x in (one, other)]
+    apart = np.degrees(np.arccos(min(1.0, abs(float(axes[0] @ axes[1])))))
+    return bool(apart > APART_STDS * np.hypot(one.std["axis_deg"], other.std["axis_deg"]))
+
+
+def _most_exact(fit: JointFit, again: JointFit, lit: JointFit) -> JointFit:
+    """Of joints found with shadows' edges, without these, and without all that may be on a shadow: the second if it is
+    sure, else the one of more than a few tracks that these miss least, doubtful."""
+    words = "without what is on a shadow's edge"
+    if not _doubtful(again):
+        return replace(again, reason=f"{words}, {again.reason}")
+    found = [(again, words), (lit, "without what may be on a shadow"), (fit, "part of what moves may be a shadow")]
+    few = FEW * max(fit.inliers, again.inliers)
+    best, words = min((x for x in found if x[0].inliers >= few and x[0].residual_px is not None),
+                      key=lambda x: float(x[0].residual_px or 0.0))  # fmt: skip
+    return replace(best, verdict="ambiguous", reason=f"{words}, {best.reason}")
 
 
 def _without(tracks: Tracks, out: np.ndarray) -> Tracks:

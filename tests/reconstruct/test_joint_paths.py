@@ -15,7 +15,7 @@ from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import Reach, normal_equations, place_points, polish, positions, residuals
 from reconstruct.joint.result import stay
-from reconstruct.joint.shadows import maybe_shadows
+from reconstruct.joint.shadows import maybe_shadows, unless_a_shadow
 from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
 from reconstruct.providers.shade import one_colour, rest_beneath
@@ -207,7 +207,8 @@ def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agr
         seen = tracks.visible.any(1)
         px = 1.0 if seen[cast].any() else {"exact": 0.4, "rough": 1.1}.get(found, 1.0)
         if seen[cast].any() or found in ("lit", "rough") or (found in ("off", "exact") and seen[30:shade].any()):
-            return JointFit(made, "made", "prismatic", point_track=np.flatnonzero(seen)[:agree], residual_px=px)
+            return JointFit(made, "made", "prismatic", point_track=np.flatnonzero(seen)[:agree], residual_px=px,
+                            inliers=agree)  # fmt: skip
         return JointFit("refused", "nothing moves")
 
     monkeypatch.setattr("reconstruct.joint.fit.fit_joint", answer)
@@ -215,6 +216,30 @@ def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agr
     tracks = replace(scene.tracks, cast=cast, shade=number < shade)
     fit = joint_off_the_arm(scene.video, tracks, nobody, None, 0, lambda _: None)
     assert fit.verdict == verdict
+    assert fit.reason.startswith(words)
+
+
+@pytest.mark.parametrize(("turn", "std", "misses", "lit_count", "verdict", "words", "px"), [
+    (60.0, 5.0, 0.08, 90, "ambiguous", "without what is on a shadow's edge, made", 0.08),
+    (60.0, 5.0, 0.12, 90, "ambiguous", "part of what moves may be a shadow, made", 0.10),
+    (60.0, 5.0, 0.08, 20, "ambiguous", "part of what moves may be a shadow, made", 0.10),
+    (60.0, 40.0, 0.08, 90, "ok", "made", 0.10),
+    (6.0, 5.0, 0.08, 90, "ok", "made", 0.10),
+])  # fmt: skip
+def test_a_joint_that_is_another_without_some_shadows_is_doubtful(turn, std, misses, lit_count, verdict, words, px):
+    """Of the two the one that its tracks miss less counts, if these are more than a few."""
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    cast = np.arange(len(scene.tracks.uv)) < 30
+
+    def made(verdict, degrees, residual_px, std, count):
+        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+        return JointFit(verdict, "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": std},
+                        point_track=np.arange(100), residual_px=residual_px, inliers=count)  # fmt: skip
+
+    tracks = replace(scene.tracks, cast=cast, shade=np.zeros(len(cast), bool))
+    again = made("ambiguous", turn, misses, std, lit_count)
+    fit = unless_a_shadow(made("ok", 0.0, 0.1, 1.0, 100), scene.video, tracks, lambda _: again)
+    assert (fit.verdict, fit.residual_px) == (verdict, px)
     assert fit.reason.startswith(words)
 
 
