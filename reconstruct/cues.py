@@ -54,7 +54,7 @@ class HandTrack:
 
 @dataclass(frozen=True)
 class Hands:
-    """All hands of a video and the pixels that hands and bare arms cover.
+    """All hands of a video and the pixels that hands and arms cover, sleeves included.
 
     Attributes:
         tracks: the hands, longest first; empty if none was seen.

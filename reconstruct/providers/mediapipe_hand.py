@@ -546,7 +546,7 @@ def detect_hands(video: Video, progress: Callable[[float], None] | None = None) 
         progress: called with the fraction done.
 
     Returns:
-        Up to three hands with landmarks in full px and metric landmarks, and the mask of hands and bare arms, those
+        Up to three hands with landmarks in full px and metric landmarks, and the mask of hands and arms, those
         of which only a part is seen included. No hand at all gives an empty tuple and an empty mask.
 
     Raises:

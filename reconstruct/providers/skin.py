@@ -1,10 +1,13 @@
-"""The pixels of hands and bare arms, from landmarks, the colour of this clip's skin and this clip's background.
+"""The pixels of hands and arms, from landmarks, the colour of this clip's skin and this clip's background.
 
 Skin colour alone will not do: tables, floors and cabinets are skin coloured. A pixel counts as hand only where three
 things agree: its colour is likelier under the skin seen between the landmarks than under the rest of the picture; it
 differs from what is seen there when no hand is (where that was ever seen); and it is connected to the landmarks within
 the hand's surroundings. In the cone behind the wrist, where only a forearm can be, the change alone is enough:
 bracelets and sleeves belong to the arm too.
+
+A hand that hardly moves shows no background. Where next to nothing else in the clip has the colour of its skin, that
+tells it alone; and a sleeve is told by its own colours, learnt from what is seen behind the end of the bare arm.
 """
 
 from __future__ import annotations
@@ -121,7 +124,7 @@ def _background(ycc: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
-    """(T, h, w) bool at working size: hands and bare arms; all False if no hand was seen."""
+    """(T, h, w) bool at working size: hands and arms, sleeves included; all False if no hand was seen."""
     import cv2
 
     n, height, width = video.frames.shape[:3]
@@ -153,7 +156,6 @@ def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
     odds = _log_density(skin) - _log_density(rest)
     is_skin, is_clearly = odds > 0.0, odds > CLEARLY
     background, known = _background(ycc, near | arm)
-
     alone = _tells_alone(is_clearly, ycc, near, arm, hands)
 
     def differing(t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -201,7 +203,6 @@ def hand_mask(video: Video, tracks: tuple[HandTrack, ...]) -> np.ndarray:
 def _tells_alone(is_skin: np.ndarray, ycc: np.ndarray, near: np.ndarray, arm: np.ndarray, hands: list) -> bool:
     """Whether nothing but hands and arms is skin coloured in this clip, so that colour alone tells them.
 
-    A hand
     A hand that rests, or hardly moves, is the only background that is ever seen there.
     """
     import cv2
