@@ -34,11 +34,10 @@ FINISHED = 3
 SLOW, SLOW_WINDOWS = 4.0, 5
 """A track belongs to a body if its mean residuals over fifths of the video have no more than so many times the power
 that noise would leave. A second body that turns slowly against the first can be fitted to a pixel, not to its mean."""
-
-
 CLEAR = 10.0
 """Log-likelihood by which a track has to prefer one of two bodies' paths to be held against it."""
 ROUNDS = 20
+"""Of that at most."""
 WORST = 0.4
 """Share of a body's tracks among which a second body is looked for where it holds tracks of both."""
 LOSS_SIGMAS = 4.0

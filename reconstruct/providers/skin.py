@@ -48,15 +48,21 @@ def _draw_hand(shape: tuple[int, int], uv: np.ndarray, thickness: float) -> np.n
     return out
 
 
-def _surroundings(shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
-    """The hand's dilated hull."""
+def _surroundings(shape: tuple[int, int], uv: np.ndarray, reach: float = 0.35) -> np.ndarray:
+    """The hand's dilated hull; reach in palm sizes."""
     import cv2
 
     out = np.zeros(shape, np.uint8)
     hull = cv2.convexHull(np.round(uv).astype(np.int32))
     cv2.fillConvexPoly(out, hull, 1)
-    cv2.polylines(out, [hull], True, 1, max(1, round(0.7 * _palm_size(uv))))
+    cv2.polylines(out, [hull], True, 1, max(1, round(2 * reach * _palm_size(uv))))
     return out
+
+
+def _backwards(uv: np.ndarray) -> np.ndarray:
+    """(2,) unit, from the knuckles to the wrist."""
+    away = uv[0] - uv[[5, 9, 13, 17]].mean(0)
+    return away / max(np.linalg.norm(away), 1e-6)
 
 
 def _forearm(shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
@@ -65,8 +71,7 @@ def _forearm(shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
 
     out = np.zeros(shape, np.uint8)
     size = _palm_size(uv)
-    knuckles = uv[[5, 9, 13, 17]].mean(0)
-    back = (uv[0] - knuckles) / max(np.linalg.norm(uv[0] - knuckles), 1e-6)
+    back = _backwards(uv)
     side = np.array([-back[1], back[0]])
     far = uv[0] + 3.0 * max(shape) * back
     spread = np.tan(np.deg2rad(35.0)) * 3.0 * max(shape)
@@ -97,11 +102,16 @@ def _connected(candidates: np.ndarray, seed: np.ndarray) -> np.ndarray:
     return np.isin(labels, touched[touched > 0])
 
 
+def _rim(shape: tuple[int, ...]) -> np.ndarray:
+    """(h, w) bool, the picture's outermost pixels."""
+    rim = np.zeros(shape, bool)
+    rim[[0, -1]] = rim[:, [0, -1]] = True
+    return rim
+
+
 def _at_border(mask: np.ndarray) -> np.ndarray:
     """Components that touch the image border."""
-    frame = np.zeros(mask.shape, bool)
-    frame[[0, -1]] = frame[:, [0, -1]] = True
-    return _connected(mask, frame)
+    return _connected(mask, _rim(mask.shape))
 
 
 def _large(mask: np.ndarray, area: float) -> np.ndarray:
@@ -220,8 +230,7 @@ def _tells_alone(is_skin: np.ndarray, ycc: np.ndarray, near: np.ndarray, arm: np
 def _arm_end(mask: np.ndarray, cone: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Wrist, direction in which the arm goes on, and how far along that it is in the mask, px."""
     size = _palm_size(uv)
-    knuckles = uv[[5, 9, 13, 17]].mean(0)
-    back = (uv[0] - knuckles) / max(np.linalg.norm(uv[0] - knuckles), 1e-6)
+    back = _backwards(uv)
     v, u = np.nonzero(mask & cone)
     away = np.stack([u, v], axis=-1) - uv[0]
     if not len(away):
@@ -245,8 +254,7 @@ def _add_sleeves(masks: np.ndarray, hands: list, arm: np.ndarray, known: np.ndar
 
     shape = masks.shape[1:]
     v, u = np.mgrid[: shape[0], : shape[1]]
-    rim = np.zeros(shape, bool)
-    rim[[0, -1]] = rim[:, [0, -1]] = True
+    rim = _rim(shape)
     sleeve = np.zeros(np.prod(BINS))
     for t, mask in enumerate(masks > 0):
         for uv in hands[t]:
@@ -286,15 +294,10 @@ def _add_tips(masks: np.ndarray, hands: list, colour: Callable[[int], np.ndarray
         if not _at_border(masks[t]).any():
             continue
         for uv in hands[t]:
-            size = _palm_size(uv)
-            reach = np.zeros(masks[t].shape, np.uint8)
-            hull = cv2.convexHull(np.round(uv).astype(np.int32))
-            cv2.fillConvexPoly(reach, hull, 1)
-            cv2.polylines(reach, [hull], True, 1, max(1, round(3.0 * size)))
             around = cv2.dilate(masks[t], kernel, iterations=3) > 0
             skin = cv2.morphologyEx((colour(t) & ~around).astype(np.uint8), cv2.MORPH_OPEN, kernel)
-            patches = _at_border(skin) & ~_large(skin > 0, 0.5 * size**2)
-            masks[t] |= _connected(patches, reach).astype(np.uint8)
+            patches = _at_border(skin) & ~_large(skin > 0, 0.5 * _palm_size(uv) ** 2)
+            masks[t] |= _connected(patches, _surroundings(masks[t].shape, uv, 1.5)).astype(np.uint8)
 
 
 def _carry_on(masks: np.ndarray, hands: list, candidates, time: np.ndarray, kernel: np.ndarray) -> None:
