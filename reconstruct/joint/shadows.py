@@ -53,12 +53,13 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     """The joint, or where many of its tracks are on shadows, what is found without these.
 
     First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
-    that its tracks follow far more exactly. Then without all that may be on one, where that is much of what still
-    agrees; a sure answer counts that its tracks follow no less exactly. In a grey world only many edges are asked of.
+    that its tracks follow far more exactly, and any that contradicts the joint makes it doubtful. Then without all that
+    may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly.
+    In a grey world only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
-    refused where it is doubtful besides.
+    refused where it is doubtful besides. Of doubtful ones the one counts that its tracks follow most exactly.
 
     Args:
         fit: the joint of all these tracks, or a refusal.
@@ -75,8 +76,7 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if not many:
         if _sharper(again, fit, SHARPER):
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
-        if _contradicts(again, fit):
-            return _most_exact(fit, again, again)
+        all_told = _most_exact(fit, again, again) if _contradicts(again, fit) else fit
         again = fit
     if again.verdict != "refused":
         may = maybe_shadows(video, tracks)
@@ -85,9 +85,11 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
         if share >= SOME_SHADOWS and _sharper(lit, again):
             return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
         if not many:
-            return fit
-        if share < SHADOWS:
+            return all_told
+        if share < SHADOWS and _doubtful(again):
             return _most_exact(fit, again, lit)
+        if share < SHADOWS:
+            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
         words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
         if again.verdict != "ok":
             return _refuse(again, f"{words}, and {_first(again.reason)}")
@@ -148,12 +150,10 @@ def _contradicts(one: JointFit, other: JointFit) -> bool:
 
 
 def _most_exact(fit: JointFit, again: JointFit, lit: JointFit) -> JointFit:
-    """Of joints found with shadows' edges, without these, and without all that may be on a shadow: the second if it is
-    sure, else the one of more than a few tracks that these miss least, doubtful."""
-    words = "without what is on a shadow's edge"
-    if not _doubtful(again):
-        return replace(again, reason=f"{words}, {again.reason}")
-    found = [(again, words), (lit, "without what may be on a shadow"), (fit, "part of what moves may be a shadow")]
+    """Of joints found with shadows' edges, without these, and without all that may be on a shadow, the one of more than
+    a few tracks that these miss least; doubtful, however sure it is by itself."""
+    found = [(again, "without what is on a shadow's edge"), (lit, "without what may be on a shadow"),
+             (fit, "part of what moves may be a shadow")]  # fmt: skip
     few = FEW * max(fit.inliers, again.inliers)
     best, words = min((x for x in found if x[0].inliers >= few and x[0].residual_px is not None),
                       key=lambda x: float(x[0].residual_px or 0.0))  # fmt: skip

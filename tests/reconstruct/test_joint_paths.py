@@ -219,6 +219,7 @@ def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agr
     assert fit.reason.startswith(words)
 
 
+@pytest.mark.parametrize("by_itself", ["ok", "ambiguous"])
 @pytest.mark.parametrize(("turn", "std", "misses", "lit_count", "verdict", "words", "px"), [
     (60.0, 5.0, 0.08, 90, "ambiguous", "without what is on a shadow's edge, made", 0.08),
     (60.0, 5.0, 0.12, 90, "ambiguous", "part of what moves may be a shadow, made", 0.10),
@@ -226,7 +227,9 @@ def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agr
     (60.0, 40.0, 0.08, 90, "ok", "made", 0.10),
     (6.0, 5.0, 0.08, 90, "ok", "made", 0.10),
 ])  # fmt: skip
-def test_a_joint_that_is_another_without_some_shadows_is_doubtful(turn, std, misses, lit_count, verdict, words, px):
+def test_a_joint_that_is_another_without_some_shadows_is_doubtful(
+    turn, std, misses, lit_count, verdict, words, px, by_itself
+):
     """Of the two the one that its tracks miss less counts, if these are more than a few."""
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     cast = np.arange(len(scene.tracks.uv)) < 30
@@ -237,7 +240,7 @@ def test_a_joint_that_is_another_without_some_shadows_is_doubtful(turn, std, mis
                         point_track=np.arange(100), residual_px=residual_px, inliers=count)  # fmt: skip
 
     tracks = replace(scene.tracks, cast=cast, shade=np.zeros(len(cast), bool))
-    again = made("ambiguous", turn, misses, std, lit_count)
+    again = made(by_itself, turn, misses, std, lit_count)
     fit = unless_a_shadow(made("ok", 0.0, 0.1, 1.0, 100), scene.video, tracks, lambda _: again)
     assert (fit.verdict, fit.residual_px) == (verdict, px)
     assert fit.reason.startswith(words)
