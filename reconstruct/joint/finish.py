@@ -57,6 +57,9 @@ SCREW_TURN_DEG, FREE_BODY = 120.0, 0.95
 no type among the others; it stands for a body that moves freely, if it is clearly more probable than they are."""
 VOTERS = 0.15
 """Edge of a neighbourhood that has a vote on the type, over the link's diagonal."""
+FEW_SPEAK = (3.0, 2.0)
+"""Votes for a hinge, and neighbourhoods whose middle track is for it, in standard deviations: below both it is a few
+tracks that speak for it, however much each of them gains."""
 UNDECIDED = 1.0
 """Log odds that are left where points out of all proportion to the link would turn the answer round."""
 NEAR, HELD = 4.0, 30.0
@@ -516,12 +519,19 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         p = probabilities({"prismatic": 0.0, "revolute": odds, "screw": odds + more})
         if turn_deg(screw) >= SCREW_TURN_DEG or p["screw"] >= FREE_BODY:
             return p
-    odds = log_odds_hinge(hinge.twist, curvature, size, _gain(hinge, slide, sight))
-    if odds * log_odds_hinge(hinge.twist, curvature, size, _cost_gain(hinge, slide, sight)) < 0:
+    odds, by_costs, alone = (
+        log_odds_hinge(hinge.twist, curvature, size, gain)
+        for gain in (_gain(hinge, slide, sight), _cost_gain(hinge, slide, sight), 0.0)
+    )
+    z = _votes(hinge, slide, sight)
+    if odds > 0 > alone and z < FEW_SPEAK[0] and _majority(hinge, slide, sight) < FEW_SPEAK[1]:
+        # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is.
+        odds = alone
+    elif odds * by_costs < 0:
         # Points that are no part of a link of any shape would turn the answer round: they are as likely to know.
         return probabilities({"prismatic": 0.0, "revolute": float(np.clip(odds, -UNDECIDED, UNDECIDED))})
     if odds > 0:
-        odds = tempered(odds, _votes(hinge, slide, sight))
+        odds = tempered(odds, z)
     elif near:
         odds = tempered(odds, -min(_votes(slide, b, sight) for b in near))
     return probabilities({"prismatic": 0.0, "revolute": odds})
@@ -546,6 +556,14 @@ def _costs(one: Bundle, other: Bundle, sight: Sightings) -> tuple[np.ndarray, np
 
 def _votes(one: Bundle, other: Bundle, sight: Sightings) -> float:
     return votes(*_costs(one, other, sight), clusters(one, sight.link, VOTERS))
+
+
+def _majority(one: Bundle, other: Bundle, sight: Sightings) -> float:
+    """By how many standard deviations more neighbourhoods have a median track that prefers one joint (sign test)."""
+    a, b = _costs(one, other, sight)
+    cluster = clusters(one, sight.link, VOTERS)
+    sides = [np.sign(np.median((b - a)[cluster == k])) for k in np.unique(cluster)]
+    return float(np.sum(sides) / np.sqrt(len(sides)))
 
 
 def _gain(one: Bundle, other: Bundle, sight: Sightings) -> float:

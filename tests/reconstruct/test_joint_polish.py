@@ -176,6 +176,32 @@ def test_a_part_of_the_tracks_does_not_make_a_free_body():
     assert type_probabilities(best, s)["screw"] > FREE_BODY
 
 
+def strayed_small_motion(kind, seed, points=120, frames=60):
+    """Both types' best for a motion of a few pixels of which a fifth of the tracks drift off by up to as much."""
+    truth, s = scene(kind, seed, points, frames, stroke=0.02 if kind == "prismatic" else 0.05)
+    rng, t, uv = np.random.default_rng(100 + seed), np.arange(frames), s.uv.copy()
+    for i in rng.choice(points, points // 5, replace=False):
+        start, drift = rng.integers(0, frames // 2), rng.normal(size=2) * 6.0 * rng.uniform()
+        uv[i] += np.clip((t - start) / (frames - start), 0, 1)[:, None] * drift
+    s = replace(s, uv=uv)
+    straight = replace(truth, kind="prismatic", twist=replace(truth.twist, curvature=np.zeros(3)))
+    across = np.linalg.svd(truth.twist.direction[None])[2][1:]
+    bent = [replace(truth, kind="revolute", twist=replace(truth.twist, curvature=e)) for e in (*across, *-across)]
+    hinges = [polish(b, s, iterations=60) for b in (bent if kind == "prismatic" else [truth])]
+    best = {"revolute": min(hinges, key=lambda b: b.cost + radius_cost(b, s))}
+    return best | {"prismatic": polish(straight, s, iterations=60)}, s
+
+
+@pytest.mark.parametrize("seed", [2, 8])
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_what_few_tracks_gain_is_no_evidence(kind, seed):
+    best, s = strayed_small_motion(kind, seed)
+    hinge, slide = best["revolute"], best["prismatic"]
+    # By its likelihood alone either would be a hinge.
+    assert (slide.cost - hinge.cost) / (2 * hinge.sigma**2) > 10
+    assert type_probabilities(best, s)[kind] > 0.9
+
+
 def test_lasting_and_shared_errors_are_measured():
     rng = np.random.default_rng(0)
     white = rng.normal(size=(40, 80, 2))
