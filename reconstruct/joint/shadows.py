@@ -21,7 +21,7 @@ from reconstruct.video import Video
 LIT_TRACKS, LIT_SHARE = 40, 0.5
 """What has to be left of the tracks that move for those on edges of brightness alone to be left out. Where most are on
 such edges the world is grey, and they say nothing of shadows (three real clips: 68 to 76 %)."""
-HARDLY_SHADOWS, SOME_SHADOWS, SHADOWS = 0.2, 0.4, 0.75
+HARDLY_SHADOWS, SOME_SHADOWS, SHADOWS = 0.1, 0.4, 0.75
 """Shares of the tracks that follow a joint (of all that moves, where none is found) on edges of shadows: below the
 first they are left in; from the second on it is asked for without them (right answers on rendered clips have up to
 0.33, wrong ones 0.35 to 1); from the third on it is a shadow's."""

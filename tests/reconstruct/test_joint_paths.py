@@ -190,13 +190,15 @@ def test_under_a_shadow_the_grain_stays_and_under_a_part_of_that_colour_it_does_
     (60, "lit", "ambiguous", 999, "ambiguous", "without what is on a shadow's edge, made"),
     (80, "lit", "ok", 999, "ok", "made"),
     (80, "exact", "ok", 60, "ok", "without what is on a shadow's edge, made"),
-    (160, "exact", "ok", 150, "ok", "made"),
-    (160, "lit", "ok", 150, "ok", "made"),
+    (160, "exact", "ok", 60, "ok", "without what is on a shadow's edge, made"),
+    (320, "exact", "ok", 60, "ok", "made"),
+    (320, "lit", "ok", 60, "ok", "made"),
 ])  # fmt: skip
 def test_a_joint_that_many_shadows_follow_is_asked_without_them(monkeypatch, agree, found, made, shade, verdict, words):
     """Found of all tracks only, without the edges of shadows (far more exactly), or without all that may be on one; a
     world in which all is shade is grey."""
-    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8,
+                       points=300)  # fmt: skip
     number = np.arange(len(scene.tracks.uv))
     cast = number < 30
     # Nothing is left out beforehand, so that all depends on who agrees.
