@@ -7,6 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+VAGUE_DEG = 10.0
+"""Standard deviation of an axis beyond which the joint is not called certain."""
+
 
 def joint_transform(
     kind: str, axis: np.ndarray, point: np.ndarray | None, q: np.ndarray | float, pitch: float | None = None

@@ -8,7 +8,7 @@ import numpy as np
 
 from reconstruct.joint.evidence import bridged, looser
 from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, turn_deg
-from reconstruct.joint.models import JointFit
+from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.polish import Bundle, Sightings, positions, residuals
 from reconstruct.joint.uncertainty import compact
 from reconstruct.joint.world import assumed_up, world_from_camera
@@ -21,8 +21,6 @@ LOOSER, RESTLESS = 2.75, 3.0
 what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
 LIKELY = 0.1
 """Probability of another axis, or type, from which on the answer is not called certain."""
-VAGUE_DEG = 10.0
-"""Standard deviation of an axis beyond which the joint is not called certain."""
 SLID_PX = 2.0
 """Working px, median, that a track may have slid along its edge for its point to be handed on."""
 

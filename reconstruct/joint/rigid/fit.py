@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.joint.models import JointFit
+from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.rigid.bundle import (
     CUT,
     State,
@@ -336,6 +336,10 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
     variance = np.maximum(np.diag(joint_cov), 0.0)
     std = {"axis_deg": float(np.degrees(np.sqrt(variance[:3].sum()))), "point_m": float(np.sqrt(variance[3:].sum())),
            "q": q_std, "covariance": joint_cov, "covariance_q": with_q}  # fmt: skip
+    if verdict == "ok" and std["axis_deg"] > VAGUE_DEG:
+        verdict = "ambiguous"
+        reason = (f"{inliers} tracks with depth hold the axis to {std['axis_deg']:.0f} deg only; a larger motion would "
+                  "tell")  # fmt: skip
     if kind == "screw":
         std["pitch"] = float(np.sqrt(max(wider * J["pitch"] @ cov_joint @ J["pitch"], 0.0)))
     px = np.linalg.norm(r[..., :2], axis=-1)[w > 0] * noise.px
