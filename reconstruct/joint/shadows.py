@@ -54,7 +54,8 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
 
     First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
     that its tracks follow far more exactly, and any that contradicts the joint makes it doubtful. Then without all that
-    may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly.
+    may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly,
+    unless it confirms the joint and knows the axis no better.
     In a grey world only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
@@ -82,10 +83,13 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
         may = maybe_shadows(video, tracks)
         share = 0.0 if _grey(tracks) else np.mean(may[again.point_track])
         lit = ask(_without(tracks, may)) if share >= SOME_SHADOWS or (many and _doubtful(again)) else again
-        if share >= SOME_SHADOWS and _sharper(lit, again):
+        confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
+        if share >= SOME_SHADOWS and not confirmed and _sharper(lit, again):
             return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
         if not many:
             return all_told
+        if confirmed:
+            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
         if share < SHADOWS and _doubtful(again):
             return _most_exact(fit, again, lit)
         if share < SHADOWS:
@@ -130,6 +134,13 @@ def _sharper(joint: JointFit, than: JointFit, times: float = 1.0) -> bool:
     """Whether a joint is sure, and its tracks miss it so many times less."""
     after, before = joint.residual_px, than.residual_px
     return joint.verdict == "ok" and after is not None and before is not None and times * after <= before
+
+
+def _confirms(other: JointFit, joint: JointFit) -> bool:
+    """Whether both are sure of one joint, whose axis the other knows no better."""
+    if (other.verdict, joint.verdict) != ("ok", "ok") or other.std is None or joint.std is None:
+        return False
+    return not _contradicts(other, joint) and bool(other.std.get("axis_deg", 0) >= joint.std.get("axis_deg", np.inf))
 
 
 def _doubtful(joint: JointFit) -> bool:

@@ -248,6 +248,28 @@ def test_a_joint_that_is_another_without_some_shadows_is_doubtful(
     assert fit.reason.startswith(words)
 
 
+@pytest.mark.parametrize(("turn", "std", "px", "words"), [
+    (6.0, 5.0, 0.10, "made"),  # the same joint, known worse: it stays
+    (6.0, 0.5, 0.05, "without what may be on a shadow, made"),  # known better
+    (60.0, 5.0, 0.05, "without what may be on a shadow, made"),  # another one
+])  # fmt: skip
+def test_a_joint_that_fewer_tracks_confirm_stays(turn, std, px, words):
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    cast = np.arange(len(scene.tracks.uv)) < 30
+
+    def made(degrees, residual_px, std):
+        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+        return JointFit("ok", "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": std},
+                        point_track=np.arange(100), residual_px=residual_px, inliers=100)  # fmt: skip
+
+    tracks = replace(scene.tracks, cast=cast, shade=np.arange(len(cast)) < 60)
+    without = {30: made(0.0, 0.1, 4.0), 60: made(turn, 0.05, std)}
+    left_out = lambda tracks: int((~tracks.visible.any(1)).sum())  # noqa: E731
+    fit = unless_a_shadow(made(0.0, 0.1, 4.0), scene.video, tracks, lambda t: without[left_out(t)])
+    assert (fit.verdict, fit.residual_px) == ("ok", px)
+    assert fit.reason.startswith(words)
+
+
 def test_what_is_beside_a_shadows_edge_may_be_on_it():
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     T = len(scene.video)
