@@ -9,6 +9,7 @@ camera's path is smoother, since the path before the other has the joint's start
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.groups import MIN_GROUP, Rigid
@@ -122,12 +123,13 @@ def before_the_link(twist: Twist, q: np.ndarray, R: np.ndarray, t: np.ndarray) -
     return R @ turn, np.einsum("tij,tj->ti", R, moved) + t
 
 
-def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:
-    """A hinge and a slide between two camera paths: starts for the bundle adjustment, in the static body's frame.
+def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
+    """A hinge and slides between two camera paths: starts for the bundle adjustment, in the static body's frame.
 
     With X = ratio * X_link in the first camera's frame, the link moves by D_t = R_t' A_t and
     d_t = R_t' (ratio a_t - t_t). A hinge has d_t = (I - D_t) c: linear in c and the ratio. Frames that do not show both
-    bodies have no say; their states are between those around.
+    bodies have no say; their states are between those around. A slide's ratio is the one by which its path is
+    straightest, or shortest: a hundredth more of the camera's path would hide a stroke of a hundredth.
     """
     both = np.flatnonzero(static.shown & link.shown)
     if len(both) < 3:
@@ -136,7 +138,7 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:
     D = np.swapaxes(R, 1, 2) @ link.R[both]
     p = np.einsum("tji,tj->ti", R, link.t[both])
     s = np.einsum("tji,tj->ti", R, static.t[both])
-    out: dict[str, Bundle] = {}
+    out: dict[str, list[Bundle]] = {}
     turns = Rotation.from_matrix(D).as_rotvec()
     points = link.X[link.members]
 
@@ -158,19 +160,26 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, Bundle]:
         if np.linalg.norm(middle - point) > 1e-6:
             twist, speed = twist_of_joint("revolute", axis, point, middle)
             q = np.interp(every, both, np.unwrap(turns @ axis))
-            out["revolute"] = Bundle("revolute", twist, (q - q[0]) * speed, v[3] * points)
-    best = (np.inf, 1.0)
-    for ratio in np.exp(np.linspace(np.log(0.3), np.log(3.0), 200)):
+            out["revolute"] = [Bundle("revolute", twist, (q - q[0]) * speed, v[3] * points)]
+
+    def crooked(log_ratio: float) -> float:
+        return float(np.linalg.svd(np.exp(log_ratio) * p - s, compute_uv=False)[1])
+
+    grid = np.linspace(np.log(0.3), np.log(3.0), 200)
+    k = int(np.argmin([crooked(x) for x in grid]))
+    around = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
+    straight = minimize_scalar(crooked, bounds=around, method="bounded").x
+    short = float(np.sum(p * s) / max(np.sum(p * p), 1e-12))
+    out["prismatic"] = []
+    for ratio in (float(np.exp(straight)), short):
+        if ratio <= 0:
+            continue
         d = ratio * p - s
-        sv = np.linalg.svd(d, compute_uv=False)
-        if sv[0] > 0 and sv[1] < best[0]:
-            best = (float(sv[1]), float(ratio))
-    d = best[1] * p - s
-    along = np.linalg.svd(d)[2][0]
-    q = d @ along
-    if abs(q.min()) > q.max():
-        along, q = -along, -q
-    q = np.interp(every, both, q)
-    middle = best[1] * np.median(points, axis=0)
-    out["prismatic"] = Bundle("prismatic", Twist(middle, along, np.zeros(3)), q - q[0], best[1] * points)
+        along = np.linalg.svd(d)[2][0]
+        q = d @ along
+        if abs(q.min()) > q.max():
+            along, q = -along, -q
+        q = np.interp(every, both, q)
+        slide = Twist(ratio * np.median(points, axis=0), along, np.zeros(3))
+        out["prismatic"].append(Bundle("prismatic", slide, q - q[0], ratio * points))
     return out

@@ -459,7 +459,7 @@ def _between(static: Rigid, link: Rigid, video: Video, paths: Paths, view: View,
     view = View(view.focal, view.focal_std, static.R, static.t)
     still = Still(np.flatnonzero(static.members), static.X[static.members])
     try:
-        done = finish({k: [b] for k, b in starts.items()}, paths, np.flatnonzero(link.members), view, still)
+        done = finish(starts, paths, np.flatnonzero(link.members), view, still)
     except NoLink:
         return JointFit("refused", NO_LINK, tracks=len(paths), inliers=int(link.members.sum())), 0.0
     if reason := why_not_believed(done):

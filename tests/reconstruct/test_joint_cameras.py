@@ -165,10 +165,30 @@ def test_frames_that_do_not_show_the_link_have_no_say_in_where_it_is_started():
     shown[12:17] = False
     t_link[~shown] += rng.normal(size=(5, 3))
     X = slide.anchor + rng.uniform(-0.1, 0.1, (20, 3))
-    start = joints_between(rigid(turn, t, X, np.ones(T, bool)), rigid(R_link, t_link, X, shown))["prismatic"]
+    starts = joints_between(rigid(turn, t, X, np.ones(T, bool)), rigid(R_link, t_link, X, shown))["prismatic"]
+    start = max(starts, key=lambda b: abs(b.twist.direction @ slide.direction))
     assert abs(start.twist.direction @ slide.direction) > 0.999
     assert np.ptp(start.q) == pytest.approx(np.ptp(q[shown]), rel=0.02)
     assert joints_between(rigid(turn, t, X, shown), rigid(R_link, t_link, X, ~shown)) == {}
+
+
+def test_a_stroke_of_a_hundredth_of_the_cameras_path_is_started_right():
+    """The two bodies' units are apart by no round factor, and what is left of the camera's path looks like a slide."""
+    T, ratio = 60, 1.0537
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(50), T), [0, 1, 0])).as_matrix()
+    t = np.array([0, 0, 1.2]) - turn @ [0, 0, 1.2]
+    slide = Twist(np.array([0.1, 0.0, 1.0]), np.array([0.0, 0.7, 0.714]), np.zeros(3))
+    worst = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        q = 0.007 * np.clip(np.linspace(-1, 2, T), 0, 1)
+        R_link, t_link = before_the_link(slide, q, turn, t)
+        X = slide.anchor + rng.uniform(-0.1, 0.1, (20, 3))
+        noisy = t_link + rng.normal(scale=0.001, size=(T, 3))
+        bodies = rigid(turn, t, X, np.ones(T, bool)), rigid(R_link, noisy / ratio, X / ratio, np.ones(T, bool))
+        starts = joints_between(*bodies)["prismatic"]
+        worst.append(max(abs(b.twist.direction @ slide.direction) for b in starts))
+    assert min(worst) > np.cos(np.radians(20))
 
 
 def test_poses_of_frames_that_show_nothing_are_between_those_around():
