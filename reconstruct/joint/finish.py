@@ -57,9 +57,9 @@ SCREW_TURN_DEG, FREE_BODY = 120.0, 0.95
 no type among the others; it stands for a body that moves freely, if it is clearly more probable than they are."""
 VOTERS = 0.15
 """Edge of a neighbourhood that has a vote on the type, over the link's diagonal."""
-FEW_SPEAK = (3.0, 2.0)
+FEW_SPEAK, BENT_DEG = (3.0, 2.0), 10.0
 """Votes for a hinge, and neighbourhoods whose middle track is for it, in standard deviations: below both it is a few
-tracks that speak for it, however much each of them gains."""
+tracks that speak for it, however much each of them gains; and the turn up to which strays bend a slide."""
 UNDECIDED = 1.0
 """Log odds that are left where points out of all proportion to the link would turn the answer round."""
 NEAR, HELD = 4.0, 30.0
@@ -524,7 +524,8 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         for gain in (_gain(hinge, slide, sight), _cost_gain(hinge, slide, sight), 0.0)
     )
     z = _votes(hinge, slide, sight)
-    if odds > 0 > alone and z < FEW_SPEAK[0] and _majority(hinge, slide, sight) < FEW_SPEAK[1]:
+    few = z < FEW_SPEAK[0] and _majority(hinge, slide, sight) < FEW_SPEAK[1]
+    if odds > 0 > alone and few and turn_deg(hinge) < BENT_DEG:
         # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is.
         odds = alone
     elif odds * by_costs < 0:
