@@ -130,6 +130,13 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
     d_t = R_t' (ratio a_t - t_t). A hinge has d_t = (I - D_t) c: linear in c and the ratio. Frames that do not show both
     bodies have no say; their states are between those around. A slide's ratio is the one by which its path is
     straightest, or shortest: a hundredth more of the camera's path would hide a stroke of a hundredth.
+
+    Args:
+        static, link: the two bodies, with T frames each and in units of their own.
+
+    Returns:
+        Of each type the starts, with states (T,) and the link's (n, 3) points in the static body's units; none where
+        fewer than three frames show both bodies.
     """
     both = np.flatnonzero(static.shown & link.shown)
     if len(both) < 3:
@@ -163,6 +170,7 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
             out["revolute"] = [Bundle("revolute", twist, (q - q[0]) * speed, v[3] * points)]
 
     def crooked(log_ratio: float) -> float:
+        """By how much the link's path is no straight line: its second singular value."""
         return float(np.linalg.svd(np.exp(log_ratio) * p - s, compute_uv=False)[1])
 
     grid = np.linspace(np.log(0.3), np.log(3.0), 200)

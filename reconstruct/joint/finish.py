@@ -12,7 +12,7 @@ from scipy.special import expit
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.cameras import before_the_link, smoother_before_the_link
 from reconstruct.joint.halves import halves, widened
-from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, probabilities, tempered, votes
+from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, majority, probabilities, tempered, votes
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
@@ -560,11 +560,7 @@ def _votes(one: Bundle, other: Bundle, sight: Sightings) -> float:
 
 
 def _majority(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    """By how many standard deviations more neighbourhoods have a median track that prefers one joint (sign test)."""
-    a, b = _costs(one, other, sight)
-    cluster = clusters(one, sight.link, VOTERS)
-    sides = [np.sign(np.median((b - a)[cluster == k])) for k in np.unique(cluster)]
-    return float(np.sum(sides) / np.sqrt(len(sides)))
+    return majority(*_costs(one, other, sight), clusters(one, sight.link, VOTERS))
 
 
 def _gain(one: Bundle, other: Bundle, sight: Sightings) -> float:

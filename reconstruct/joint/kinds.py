@@ -85,6 +85,20 @@ def votes(for_one: np.ndarray, for_other: np.ndarray, cluster: np.ndarray) -> fl
     return float(by.sum()) / spread if spread > 0 else 0.0
 
 
+def majority(for_one: np.ndarray, for_other: np.ndarray, cluster: np.ndarray) -> float:
+    """By how many standard deviations more neighbourhoods of the link have a median track that prefers one joint to
+    another than the other way round (sign test).
+
+    Args:
+        for_one, for_other: (N,) cost of every track under either, N > 0.  cluster: (N,) its neighbourhood.
+
+    Returns:
+        Positive for the first.
+    """
+    sides = [np.sign(np.median((for_other - for_one)[cluster == k])) for k in np.unique(cluster)]
+    return float(np.sum(sides) / np.sqrt(len(sides)))
+
+
 def tempered(odds: float, z: float) -> float:
     """Log odds no surer than the votes `z` for the side that they favour.
 

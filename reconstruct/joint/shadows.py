@@ -55,8 +55,7 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
     that its tracks follow far more exactly, and any that contradicts the joint makes it doubtful. Then without all that
     may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly,
-    unless it confirms the joint and knows the axis no better.
-    In a grey world only many edges are asked of.
+    unless it confirms the joint and knows the axis no better. In a grey world only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
@@ -88,11 +87,9 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
             return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
         if not many:
             return all_told
-        if confirmed:
-            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
         if share < SHADOWS and _doubtful(again):
             return _most_exact(fit, again, lit)
-        if share < SHADOWS:
+        if share < SHADOWS or confirmed:
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
         words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
         if again.verdict != "ok":
@@ -138,7 +135,7 @@ def _sharper(joint: JointFit, than: JointFit, times: float = 1.0) -> bool:
 
 def _confirms(other: JointFit, joint: JointFit) -> bool:
     """Whether both are sure of one joint, whose axis the other knows no better."""
-    if (other.verdict, joint.verdict) != ("ok", "ok") or other.std is None or joint.std is None:
+    if (other.verdict, joint.verdict) != ("ok", "ok"):
         return False
     return not _contradicts(other, joint) and bool(other.std.get("axis_deg", 0) >= joint.std.get("axis_deg", np.inf))
 
