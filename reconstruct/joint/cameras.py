@@ -21,6 +21,8 @@ STILL_SHARE = 0.15
 """A camera moves if fewer tracks than this share stay where they are."""
 DEGREE = 4
 """Of the polynomials that a smooth path follows."""
+LEAST_RATIO = 0.05
+"""Of the link's scale to the scene's that is believed of a hinge between noisy paths."""
 TELLS = 5.0
 """Log-likelihood by which a path has to be smoother to be the one before the scene."""
 
@@ -161,13 +163,16 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
         v = np.linalg.lstsq(sides * w[:, None], b * w, rcond=None)[0]
         r = sides @ v - b
         w = 1 / np.sqrt(1 + (r / (1.5 * np.median(np.abs(r)) + 1e-9)) ** 2)
-    if v[3] > 0.05:
-        middle = v[3] * np.median(points, axis=0)
-        point = v[:3] - axis * ((v[:3] - middle) @ axis)
-        if np.linalg.norm(middle - point) > 1e-6:
-            twist, speed = twist_of_joint("revolute", axis, point, middle)
-            q = np.interp(every, both, np.unwrap(turns @ axis))
-            out["revolute"] = [Bundle("revolute", twist, (q - q[0]) * speed, v[3] * points)]
+    ratio = v[3]
+    if ratio <= LEAST_RATIO:  # hidden by what the paths have drifted: parts of one object are about as far away
+        ratio = 1.0
+        v = np.append(np.linalg.lstsq(sides[:, :3] * w[:, None], (b - ratio * sides[:, 3]) * w, rcond=None)[0], ratio)
+    middle = ratio * np.median(points, axis=0)
+    point = v[:3] - axis * ((v[:3] - middle) @ axis)
+    if np.linalg.norm(middle - point) > 1e-6:
+        twist, speed = twist_of_joint("revolute", axis, point, middle)
+        q = np.interp(every, both, np.unwrap(turns @ axis))
+        out["revolute"] = [Bundle("revolute", twist, (q - q[0]) * speed, ratio * points)]
 
     def crooked(log_ratio: float) -> float:
         """By how much the link's path is no straight line: its second singular value."""

@@ -10,7 +10,7 @@ bundle adjustment.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -94,6 +94,7 @@ def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | 
     others = _larger(rigid_group(uv, focal, asked & ~one.members, seed), other)
     if again is not one or others is not other:
         one, other = _told_apart(uv, focal, again, others, asked) or (again, others)
+    one, other = begun_beside(uv, focal, one, other, asked), begun_beside(uv, focal, other, one, asked)
     if one.shown.sum() < other.shown.sum():
         # Of a scene the camera's path is asked in every frame, a link may be out of sight for a while.
         return other, one
@@ -102,6 +103,23 @@ def two_bodies(uv: np.ndarray, focal: float, seed: int = 0, asked: np.ndarray | 
 
 def _larger(new: Rigid | None, old: Rigid) -> Rigid:
     return old if new is None or new.members.sum() <= old.members.sum() else new
+
+
+def begun_beside(uv: np.ndarray, focal: float, body: Rigid, other: Rigid, asked: np.ndarray) -> Rigid:
+    """The body with its path searched from the other's, where that ends at a better one.
+
+    Bodies with a joint between them go nearly alike before a camera that goes round both, and the path before one of
+    them may have come to rest beside its optimum (a flatter body that turns more).
+    """
+    start = replace(other, X=body.X, members=body.members)
+    new = regrown(uv, focal, start, asked & ~(other.members & ~body.members))
+    if new is start:
+        return body
+    some = new.members | body.members
+    x, scale = uv[some] / focal, LOSS_SIGMAS * max(min(new.sigma, body.sigma), 0.25)
+    seen = np.isfinite(x[..., 0])
+    cost = [float(_track_cost(x, seen, b.R, b.t, b.X[some], focal, scale).sum()) for b in (new, body)]
+    return new if cost[0] < cost[1] else body
 
 
 def _told_apart(uv: np.ndarray, focal: float, one: Rigid, other: Rigid, asked: np.ndarray
