@@ -27,7 +27,7 @@ from reconstruct.joint.polish import (
     robust_loss,
     track_costs,
 )
-from reconstruct.joint.states import held_only
+from reconstruct.joint.states import held_only, in_sight_only
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import (
     Spread,
@@ -233,7 +233,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best = {kind: polish(b, sight) for kind, b in best.items()}
         best, sight = held_only(best, sight) if view.R is None and sight.slip is None else (best, sight)
     else:
-        best, sight = _together(_across_kinds(best, sight), sight, paths, still, view)
+        best, sight = in_sight_only(*_together(_across_kinds(best, sight), sight, paths, still, view))
     sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
     probability = type_probabilities(best, sight)
@@ -262,7 +262,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     else:
         apart = ~np.isin(still.ids, members)
         rest = replace(still, ids=still.ids[apart], X=still.X[apart])
-        best, few = _together(best, few, paths, rest, view)
+        best, few = in_sight_only(*_together(best, few, paths, rest, view))
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
     once, last, sure, probability, rival = _decided(best, others if still is None else None, few)

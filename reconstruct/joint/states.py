@@ -29,10 +29,11 @@ def held_frames(b: Bundle, s: Sightings) -> np.ndarray:
     """(T,) bool: frames whose state tracks of the link agree on.
 
     Args:
-        b: the joint.  s: its observations before a resting camera.
+        b: the joint.  s: its observations.
     """
-    near = s.seen & (np.linalg.norm(residuals(b, s), axis=-1) < ROBUST_SIGMAS * max(b.sigma, 0.05))
-    return near.sum(0) >= np.maximum(HOLDERS, HOLDING * s.seen.sum(0))
+    seen = s.seen if s.link is None else s.seen & s.link[:, None]
+    near = seen & (np.linalg.norm(residuals(b, s), axis=-1) < ROBUST_SIGMAS * max(b.sigma, 0.05))
+    return near.sum(0) >= np.maximum(HOLDERS, HOLDING * seen.sum(0))
 
 
 def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:
@@ -52,6 +53,23 @@ def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle],
     every = np.arange(len(held))
     found = {kind: with_states(b, np.interp(every, every[held], b.q[held])) for kind, b in found.items()}
     return found, replace(s, seen=s.seen & held)
+
+
+def in_sight_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:
+    """Joints and sightings before a moving camera without the frames in which few tracks of the link are seen and no
+    joint is held: what is seen there is one or two strays. These states are between those around.
+
+    Args:
+        best: joints of every type with the camera's path, of the same tracks.  s: their sightings of link and scene.
+    """
+    assert s.link is not None
+    count = (s.seen & s.link[:, None]).sum(0)
+    held = np.logical_or.reduce([held_frames(b, s) for b in best.values()]) | (count > FEW * count.max())
+    if not (count.astype(bool) & ~held).any() or held.sum() < 2:
+        return best, s
+    every = np.arange(len(held))
+    best = {kind: with_states(b, np.interp(every, every[held], b.q[held]), s.link) for kind, b in best.items()}
+    return best, replace(s, seen=s.seen & (held | ~s.link[:, None]))
 
 
 def found_again(b: Bundle, s: Sightings) -> Bundle:
@@ -90,8 +108,13 @@ def found_again(b: Bundle, s: Sightings) -> Bundle:
     return with_states(b, q)
 
 
-def with_states(b: Bundle, q: np.ndarray) -> Bundle:
+def with_states(b: Bundle, q: np.ndarray, link: np.ndarray | None = None) -> Bundle:
     """The same motion in states q (T,), path lengths as in :class:`Bundle`: the points are those of the first, which
-    becomes 0 again."""
+    becomes 0 again.
+
+    Args:
+        link: (N,) bool, points that move; all of them when None.
+    """
     R, p = (x[0] for x in b.twist.pose(q[:1]))
-    return replace(b, q=q - q[0], X=(b.X - b.twist.anchor) @ R.T + p + b.twist.anchor)
+    X = (b.X - b.twist.anchor) @ R.T + p + b.twist.anchor
+    return replace(b, q=q - q[0], X=X if link is None else np.where(link[:, None], X, b.X))

@@ -7,8 +7,8 @@ import pytest
 
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.paths import Paths
-from reconstruct.joint.polish import Bundle, polish, positions
-from reconstruct.joint.states import found_again, held_frames, held_only, with_states
+from reconstruct.joint.polish import Bundle, polish, positions, residuals
+from reconstruct.joint.states import found_again, held_frames, held_only, in_sight_only, with_states
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
 KINDS = ("revolute", "prismatic")
@@ -64,6 +64,35 @@ def test_frames_that_agree_on_no_state_have_no_say(kind):
     assert held_only({kind: replace(truth, sigma=0.5)}, replace(lost, seen=s.seen))[1].seen.all()  # they contradict it
     same, all_of_it = held_only({kind: truth}, s)
     assert all_of_it is s and same[kind] is truth
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_a_moving_camera_has_lost_the_link_one_stray_does_not_carry_it_on(kind):
+    """A burner was refused whose last third a stray made nine tenths of the stroke."""
+    truth, s = scene(kind, 2)
+    T = len(truth.q)
+    since = T - 12
+    still = np.arange(60) < 40
+    link = ~still
+    seen = s.seen.copy()
+    seen[link, since:] = False
+    seen[59, since:] = True
+    off = truth.q.copy()
+    off[since:] += np.linspace(1.0, 9.0, T - since) * np.ptp(truth.q)
+    R, t = np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, 3))
+    both = replace(s, seen=seen, link=link, free=True)
+    uv = residuals(replace(truth, R=R, t=t), replace(both, uv=np.zeros_like(s.uv)))
+    uv[59, since:] = residuals(replace(truth, q=off, R=R, t=t), replace(both, uv=np.zeros_like(s.uv)))[59, since:]
+    both = replace(both, uv=uv)
+    b = replace(truth, q=off, R=R, t=t, sigma=0.5)
+    best, kept = in_sight_only({kind: b}, both)
+    assert not kept.seen[link, since:].any() and kept.seen[still].all() and kept.seen[link, :since].all()
+    assert np.allclose(best[kind].q[since:], truth.q[since - 1])
+    assert np.allclose(best[kind].X, truth.X)
+    # A state that few tracks hold, but hold, stays.
+    seen[link, since:] = True
+    same, all_of_it = in_sight_only({kind: replace(b, q=truth.q)}, replace(both, seen=seen))
+    assert all_of_it.seen.all() and same[kind].q is truth.q
 
 
 def test_an_end_without_tracks_does_not_run_off():
