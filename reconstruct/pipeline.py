@@ -324,6 +324,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     else moves, and asked where nothing is found without it.
     """
     from reconstruct.hand.forearm import on_forearm
+    from reconstruct.joint.edges import unless_one_edge
     from reconstruct.joint.fit import fit_joint, moving_tracks
     from reconstruct.joint.shadows import off_shadows, unless_a_shadow
     from reconstruct.providers.lk_tracks import pictures_of
@@ -341,6 +342,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     if fit.verdict == "refused" and lit is not rest:
         fit, asked = ask(rest), rest
     fit = unless_a_shadow(fit, video, asked, ask)
+    fit = unless_one_edge(fit, video, asked, lambda some: unless_a_shadow(ask(some), video, some, ask))
     if fit.verdict == "refused" and share >= ARM_SHARE:
         again = unless_a_shadow(ask(tracks), video, tracks, ask)
         return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again

@@ -46,7 +46,7 @@ def off_shadows(video: Video, tracks: Tracks) -> Tracks:
     left = int((~tracks.shade[moving]).sum())
     if left == len(moving) or left < max(LIT_TRACKS, LIT_SHARE * len(moving)):
         return tracks
-    return _without(tracks, tracks.shade)
+    return without(tracks, tracks.shade)
 
 
 def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[Tracks], JointFit]) -> JointFit:
@@ -55,7 +55,9 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
     that its tracks follow far more exactly, and any that contradicts the joint makes it doubtful. Then without all that
     may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly,
-    unless it confirms the joint and knows the axis no better. In a grey world only many edges are asked of.
+    unless it confirms the joint and knows the axis no better. It is asked so as well where much of the joint was on
+    edges and some of what is left may be; any sure answer that contradicts it makes the joint doubtful. In a grey world
+    only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
@@ -72,22 +74,23 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     many = np.mean(cast) >= SOME_SHADOWS
     if not many and (refused or _grey(tracks)):
         return fit
-    again = ask(_without(tracks, tracks.cast))
+    again = ask(without(tracks, tracks.cast))
     if not many:
         if _sharper(again, fit, SHARPER):
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
-        all_told = _most_exact(fit, again, again) if _contradicts(again, fit) else fit
+        all_told = _most_exact(fit, again, again) if contradicts(again, fit) else fit
         again = fit
     if again.verdict != "refused":
         may = maybe_shadows(video, tracks)
         share = 0.0 if _grey(tracks) else np.mean(may[again.point_track])
-        lit = ask(_without(tracks, may)) if share >= SOME_SHADOWS or (many and _doubtful(again)) else again
+        asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
+        lit = ask(without(tracks, may)) if asked else again
         confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
         if share >= SOME_SHADOWS and not confirmed and _sharper(lit, again):
             return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
         if not many:
             return all_told
-        if share < SHADOWS and _doubtful(again):
+        if share < SHADOWS and (_doubtful(again) or (lit.verdict == "ok" and contradicts(lit, again))):
             return _most_exact(fit, again, lit)
         if share < SHADOWS or confirmed:
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
@@ -137,14 +140,14 @@ def _confirms(other: JointFit, joint: JointFit) -> bool:
     """Whether both are sure of one joint, whose axis the other knows no better."""
     if (other.verdict, joint.verdict) != ("ok", "ok"):
         return False
-    return not _contradicts(other, joint) and bool(other.std.get("axis_deg", 0) >= joint.std.get("axis_deg", np.inf))
+    return not contradicts(other, joint) and bool(other.std.get("axis_deg", 0) >= joint.std.get("axis_deg", np.inf))
 
 
 def _doubtful(joint: JointFit) -> bool:
     return joint.verdict == "ambiguous"
 
 
-def _contradicts(one: JointFit, other: JointFit) -> bool:
+def contradicts(one: JointFit, other: JointFit) -> bool:
     """Whether two joints are of different types, or their axes further apart than both say they may be."""
     if "refused" in (one.verdict, other.verdict):
         return False
@@ -168,7 +171,7 @@ def _most_exact(fit: JointFit, again: JointFit, lit: JointFit) -> JointFit:
     return replace(best, verdict="ambiguous", reason=f"{words}, {best.reason}")
 
 
-def _without(tracks: Tracks, out: np.ndarray) -> Tracks:
+def without(tracks: Tracks, out: np.ndarray) -> Tracks:
     return replace(tracks, visible=tracks.visible & ~out[:, None])
 
 

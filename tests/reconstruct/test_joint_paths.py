@@ -270,6 +270,34 @@ def test_a_joint_that_fewer_tracks_confirm_stays(turn, std, px, words):
     assert fit.reason.startswith(words)
 
 
+@pytest.mark.parametrize(("lit", "turn", "verdict", "px"), [
+    ("ok", 70.0, "ambiguous", 0.05),  # another joint: doubtful, and the one that its tracks miss least
+    ("ok", 1.0, "ok", 0.1),
+    ("ambiguous", 70.0, "ok", 0.1),  # which says nothing
+])  # fmt: skip
+def test_of_a_joint_that_was_mostly_a_shadow_some_more_that_may_be_one_makes_it_doubtful(
+    lit, turn, verdict, px, monkeypatch
+):
+    """A blade and a hand's shadow were a sure hinge so: a third of its tracks were beside edges that were left out."""
+    monkeypatch.setattr("reconstruct.joint.shadows.BESIDE_PX", 0.0)
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    number = np.arange(len(scene.tracks.uv))
+    shade = (number < 45) | ((125 <= number) & (number < 140))
+    tracks = replace(scene.tracks, cast=number < 45, shade=shade)
+
+    def made(verdict, degrees, residual_px, ids):
+        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+        return JointFit(verdict, "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": 2.0},
+                        point_track=ids, residual_px=residual_px, inliers=len(ids))  # fmt: skip
+
+    def ask(some):
+        left_out = int((~some.visible.any(1)).sum())
+        return made("ok", 0.0, 0.1, number[60:140]) if left_out == 45 else made(lit, turn, 0.05, number[60:125])
+
+    fit = unless_a_shadow(made("ok", 30.0, 0.3, number[:100]), scene.video, tracks, ask)
+    assert (fit.verdict, fit.residual_px) == (verdict, px)
+
+
 def test_what_is_beside_a_shadows_edge_may_be_on_it():
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     T = len(scene.video)
