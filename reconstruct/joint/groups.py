@@ -111,15 +111,13 @@ def begun_beside(uv: np.ndarray, focal: float, body: Rigid, other: Rigid, asked:
     Bodies with a joint between them go nearly alike before a camera that goes round both, and the path before one of
     them may have come to rest beside its optimum (a flatter body that turns more).
     """
-    start = replace(other, X=body.X, members=body.members)
-    new = regrown(uv, focal, start, asked & ~(other.members & ~body.members))
-    if new is start:
-        return body
-    some = new.members | body.members
-    x, scale = uv[some] / focal, LOSS_SIGMAS * max(min(new.sigma, body.sigma), 0.25)
+    new = regrown(uv, focal, replace(other, members=body.members), body.members)
+    # Held against its own tracks: what it could take from the other body would not tell which path is right.
+    x, scale = uv[body.members] / focal, LOSS_SIGMAS * max(min(new.sigma, body.sigma), 0.25)
     seen = np.isfinite(x[..., 0])
-    cost = [float(_track_cost(x, seen, b.R, b.t, b.X[some], focal, scale).sum()) for b in (new, body)]
-    return new if cost[0] < cost[1] else body
+    cost = [_track_cost(x, seen, b.R, b.t, b.X[body.members], focal, scale) * seen.sum(1) for b in (body, new)]
+    better = 0.5 * LOSS_SIGMAS**2 * float(np.sum(cost[0] - cost[1]))
+    return regrown(uv, focal, new, asked & ~other.members) if better > CLEAR else body
 
 
 def _told_apart(uv: np.ndarray, focal: float, one: Rigid, other: Rigid, asked: np.ndarray
