@@ -292,17 +292,17 @@ class _Priors:
 
 
 def frames_held(s: Sightings, w: np.ndarray) -> np.ndarray:
-    """(k,) frames whose state tracks hold: by the robust loss's weights (N, T), or with slip wherever they are seen, as
-    such tracks end where they are lost; all of them where these are too few.
+    """(k,) frames whose state tracks hold, of the link and, before a moving camera, of the scene too: by the robust
+    loss's weights (N, T), or with slip wherever they are seen, as such tracks end where they are lost; all of them
+    where these are too few.
 
     Where a tracker has lost everything a state may run off for nothing: in units of its own path it would not be bent,
     and of a hinge that is far away it would be what makes it near.
     """
     near, least = (w > 0.25 * s.weight[:, None], HOLDERS) if s.slip is None else (s.seen, 1)
-    if s.link is not None:
-        near = near[s.link]
-    held = np.flatnonzero(near.sum(0) >= least)
-    return held if len(held) > 1 else np.arange(len(near[0]))
+    bodies = [near] if s.link is None else [near[s.link], near[~s.link]]
+    held = np.flatnonzero(np.all([body.sum(0) >= least for body in bodies], axis=0))
+    return held if len(held) > 1 else np.arange(near.shape[1])
 
 
 def radius_cost(b: Bundle, s: Sightings) -> float:

@@ -7,7 +7,7 @@ import pytest
 
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.paths import Paths
-from reconstruct.joint.polish import Bundle, polish, positions, residuals
+from reconstruct.joint.polish import Bundle, frames_held, polish, positions, residuals
 from reconstruct.joint.states import found_again, held_frames, held_only, in_sight_only, with_states
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
@@ -93,6 +93,18 @@ def test_where_a_moving_camera_has_lost_the_link_one_stray_does_not_carry_it_on(
     seen[link, since:] = True
     same, all_of_it = in_sight_only({kind: replace(b, q=truth.q)}, replace(both, seen=seen))
     assert all_of_it.seen.all() and same[kind].q is truth.q
+
+
+def test_a_state_before_a_lost_camera_is_no_part_of_the_stroke():
+    """The first frame of one was 62 deg off and an end of the stroke, which nothing was known of then."""
+    _, s = scene("revolute", 3)
+    link = np.arange(60) < 40
+    w = s.weight[:, None] * s.seen
+    w[link, 7] = 0.0
+    w[~link, 0] = 0.0
+    assert frames_held(replace(s, link=link), w).tolist() == [t for t in range(s.seen.shape[1]) if t not in (0, 7)]
+    w[link, 0] = 0.0
+    assert frames_held(s, w).tolist() == list(range(1, s.seen.shape[1]))
 
 
 def test_an_end_without_tracks_does_not_run_off():
