@@ -61,7 +61,7 @@ FEW_SPEAK, BENT_DEG = (3.0, 2.0), 10.0
 """Votes for a hinge, and neighbourhoods whose middle track is for it, in standard deviations: below both it is a few
 tracks that speak for it, however much each of them gains; and the turn up to which strays bend a slide."""
 UNDECIDED = 1.0
-"""Log odds that are left where points out of all proportion to the link would turn the answer round."""
+"""Log odds that are left where points out of all proportion to the link would turn the answer round, or the votes."""
 NEAR, HELD = 4.0, 30.0
 """A hinge is as near as hinges are if the logarithm of its radius is within two standard deviations of the prior; and
 how much more than it is worth the prior counts to get there."""
@@ -523,8 +523,8 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         log_odds_hinge(hinge.twist, curvature, size, gain)
         for gain in (_gain(hinge, slide, sight), _cost_gain(hinge, slide, sight), 0.0)
     )
-    z = _votes(hinge, slide, sight)
-    few = z < FEW_SPEAK[0] and _majority(hinge, slide, sight) < FEW_SPEAK[1]
+    z, most = _votes(hinge, slide, sight), _majority(hinge, slide, sight)
+    few = z < FEW_SPEAK[0] and most < FEW_SPEAK[1]
     if odds > 0 > alone and few and turn_deg(hinge) < BENT_DEG:
         # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is.
         odds = alone
@@ -535,6 +535,9 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         odds = tempered(odds, z)
     elif near:
         odds = tempered(odds, -min(_votes(slide, b, sight) for b in near))
+    if odds == 0:
+        # The votes are against what they should confirm: where most neighbourhoods are, whatever the few gain, leads.
+        odds = float(np.copysign(UNDECIDED, most))
     return probabilities({"prismatic": 0.0, "revolute": odds})
 
 

@@ -202,6 +202,21 @@ def test_what_few_tracks_gain_is_no_evidence(kind, seed):
     assert type_probabilities(best, s)[kind] > 0.9
 
 
+@pytest.mark.parametrize(("most", "leads"), [(-0.2, "prismatic"), (0.2, "revolute")])
+def test_where_the_votes_are_against_the_odds_the_side_of_most_neighbourhoods_leads(most, leads, monkeypatch):
+    """Blades and a drawer of some pixels were hinges so, the more frequent type; none of them is sure."""
+    truth, s = scene("prismatic", 0)
+    across = np.linalg.svd(truth.twist.direction[None])[2][1]
+    near = replace(truth, kind="revolute", twist=replace(truth.twist, curvature=2.0 * across))
+    best = {"prismatic": polish(truth, s), "revolute": polish(near, s, iterations=60)}
+    assert type_probabilities(best, s, [near])["prismatic"] > 0.9
+    monkeypatch.setattr("reconstruct.joint.finish._votes", lambda *_: -1.0)
+    monkeypatch.setattr("reconstruct.joint.finish._majority", lambda *_: most)
+    p = type_probabilities(best, s, [near])
+    assert max(p, key=lambda kind: p[kind]) == leads
+    assert p[leads] < 0.9
+
+
 def test_lasting_and_shared_errors_are_measured():
     rng = np.random.default_rng(0)
     white = rng.normal(size=(40, 80, 2))
