@@ -23,6 +23,7 @@ from reconstruct.joint.finish import (
 )
 from reconstruct.joint.groups import Rigid, two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
+from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
@@ -101,7 +102,8 @@ def fit_joint(
         progress: called with the done share.
         camera_moving: whether the camera moves; judged from how many tracks keep their place when None. A moving one
             is found together with the joint, from the static scene's tracks; the world is then up to the first camera.
-            Where it is not said and all tracks move as one body, the answer is "ambiguous".
+            Where it is not said and all tracks move as one body, the answer is "ambiguous", its type no surer than one
+            half and half of the prior: it may be the camera that moves.
         pictures: of the video's frames, working px. Where the camera rests, a hinge that the link's whole faces hold
             better than the tracks do is taken from them.
 
@@ -144,8 +146,9 @@ def fit_joint(
     elif answer.verdict == "refused" and tracks.slip is None:
         answer = _of_a_part(video, paths, camera, view, known, rng, pictures) or answer
     tell(1.0)
-    if all_moves and answer.verdict == "ok":
-        return replace(answer, verdict="ambiguous", reason=f"{ALONE}; {answer.reason}")
+    if all_moves and answer.verdict != "refused":
+        p = or_by_prior(answer.type_probability)
+        return replace(answer, verdict="ambiguous", reason=f"{ALONE}; {answer.reason}", type_probability=p)
     return answer
 
 

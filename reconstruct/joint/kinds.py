@@ -117,6 +117,13 @@ def probabilities(log_odds: dict[str, float]) -> dict[str, float]:
     return {k: v / sum(p.values()) for k, v in p.items()}
 
 
+def or_by_prior(probability: dict[str, float]) -> dict[str, float]:
+    """Probabilities of the types where what they were judged by is as likely no joint's motion at all, and says nothing
+    of one then."""
+    total = sum(PRIOR[k] for k in probability)
+    return {k: (p + PRIOR[k] / total) / 2 for k, p in probability.items()}
+
+
 def _across(twist: Twist) -> np.ndarray:
     """(3, 2) basis of the curvatures that a hinge may have: perpendicular to the motion."""
     from reconstruct.joint.hypotheses import perpendicular_basis

@@ -164,6 +164,9 @@ def test_a_body_that_is_all_there_is_may_be_a_scene_before_a_camera_that_goes_ro
         fit = fit_joint(*filmed(tracks), FOCAL, camera_moving=moving)
         assert (fit.verdict, fit.type) == (verdict, "revolute")
         assert fit.reason.startswith("all that is followed moves as one body") == (moving is None)
+        # It may be the camera that moves, and nothing is known of the type then.
+        assert (fit.type_probability["revolute"] > 0.9) == (moving is False)
+        assert sum(fit.type_probability.values()) == pytest.approx(1)
 
 
 def rigid(R, t, X, shown):
