@@ -321,7 +321,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     Sleeves often have more tracks than the part, and go nearly as it goes. Where nothing is found without them and
     they were many, the wedge of an arm may have held the part: then all tracks are asked, and a joint that is not
     mostly an arm's counts. Shadows go nearly as the part goes too. What may be the edge of one is left out where enough
-    else moves, and asked where nothing is found without it.
+    else moves, and asked where nothing is found without it. What one straight edge alone follows is no sure joint.
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.edges import unless_one_edge
@@ -338,13 +338,15 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     def ask(some: Tracks) -> JointFit:
         return fit_joint(video, some, focal, seed, progress, camera_moving=False, pictures=pictures)
 
+    def off_shadows_too(some: Tracks) -> JointFit:
+        return unless_a_shadow(ask(some), video, some, ask)
+
     fit, asked = ask(lit), lit
     if fit.verdict == "refused" and lit is not rest:
         fit, asked = ask(rest), rest
-    fit = unless_a_shadow(fit, video, asked, ask)
-    fit = unless_one_edge(fit, video, asked, lambda some: unless_a_shadow(ask(some), video, some, ask))
+    fit = unless_one_edge(unless_a_shadow(fit, video, asked, ask), video, asked, off_shadows_too)
     if fit.verdict == "refused" and share >= ARM_SHARE:
-        again = unless_a_shadow(ask(tracks), video, tracks, ask)
+        again = unless_one_edge(off_shadows_too(tracks), video, tracks, off_shadows_too)
         return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit

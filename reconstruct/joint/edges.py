@@ -57,6 +57,8 @@ def on_one_edge(video: Video, tracks: Tracks, ids: np.ndarray) -> bool:
     Args:
         ids: (n,) indices of the tracks.
     """
+    if not len(ids):
+        return False
     uv, seen = video.to_work(tracks.uv[ids]), tracks.visible[ids]
     enough = np.flatnonzero(seen.sum(0) >= max(3, 0.5 * seen.sum(0).max()))
     looks = np.unique(enough[np.linspace(0, len(enough) - 1, LOOKS).round().astype(int)])

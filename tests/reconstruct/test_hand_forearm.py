@@ -69,6 +69,7 @@ def _asked(share, monkeypatch, refuses, on_the_arm=False):
     sleeve = wrist + (rng.uniform(30, 250, (int(100 * share), 1)) * along)[:, None]
     held = wrist - (rng.uniform(90, 250, (100 - len(sleeve), 1)) * along)[:, None]
     uv = np.concatenate([sleeve, held]).astype(np.float32)
+    uv += (rng.uniform(-9, 9, (100, 1)) * [-along[1], along[0]])[:, None]  # what is on one line is asked again
     tracks = Tracks(uv, np.ones(uv.shape[:2], bool), np.zeros(100, int), MADE)
     arms, asked = np.arange(100) < len(sleeve), []
 
