@@ -25,15 +25,15 @@ MOST_STATES, MOST_ASKED = 400, 150
 """States that are tried at most, and tracks that are asked."""
 
 
-def held_frames(b: Bundle, s: Sightings) -> np.ndarray:
+def held_frames(b: Bundle, s: Sightings, share: float = HOLDING) -> np.ndarray:
     """(T,) bool: frames whose state tracks of the link agree on.
 
     Args:
-        b: the joint.  s: its observations.
+        b: the joint.  s: its observations.  share: of the tracks in sight that have to agree, HOLDERS at least.
     """
     seen = s.seen if s.link is None else s.seen & s.link[:, None]
     near = seen & (np.linalg.norm(residuals(b, s), axis=-1) < ROBUST_SIGMAS * max(b.sigma, 0.05))
-    return near.sum(0) >= np.maximum(HOLDERS, HOLDING * seen.sum(0))
+    return near.sum(0) >= np.maximum(HOLDERS, share * seen.sum(0))
 
 
 def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:
@@ -56,15 +56,15 @@ def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle],
 
 
 def in_sight_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:
-    """Joints and sightings before a moving camera without the frames in which few tracks of the link are seen and no
-    joint is held: what is seen there is one or two strays. These states are between those around.
+    """Joints and sightings before a moving camera without the frames in which few tracks of the link are seen, of which
+    hardly any agree on a state: one or two strays. These states are between those around.
 
     Args:
         best: joints of every type with the camera's path, of the same tracks.  s: their sightings of link and scene.
     """
     assert s.link is not None
     count = (s.seen & s.link[:, None]).sum(0)
-    held = np.logical_or.reduce([held_frames(b, s) for b in best.values()]) | (count > FEW * count.max())
+    held = np.logical_or.reduce([held_frames(b, s, 0.0) for b in best.values()]) | (count > FEW * count.max())
     if not (count.astype(bool) & ~held).any() or held.sum() < 2:
         return best, s
     every = np.arange(len(held))
