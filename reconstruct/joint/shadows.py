@@ -175,6 +175,7 @@ def _most_exact(fit: JointFit, again: JointFit, lit: JointFit) -> JointFit:
 
 
 def without(tracks: Tracks, out: np.ndarray) -> Tracks:
+    """The tracks with some, (N,) bool, never seen: the others keep their numbers."""
     return replace(tracks, visible=tracks.visible & ~out[:, None])
 
 
