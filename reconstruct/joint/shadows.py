@@ -56,9 +56,9 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     that its tracks follow far more exactly, and any that contradicts the joint makes it doubtful. Then without all that
     may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly,
     unless it confirms the joint and knows the axis no better. It is asked so as well where much of the joint was on
-    edges and some of what is left may be; any sure answer that contradicts it makes the joint doubtful. So do two sure
-    ones, with all and with the least, that contradict each other beside a doubtful one. In a grey world only many edges
-    are asked of.
+    edges and some of what is left may be; any sure answer that contradicts it makes the joint doubtful. What counts is
+    doubtful too where a sure one with all contradicts it beside a doubtful one. In a grey world only many edges are
+    asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
@@ -88,9 +88,9 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
         lit = ask(without(tracks, may)) if asked else again
         confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
         if share >= SOME_SHADOWS and not confirmed and _sharper(lit, again):
-            if fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit):
-                return _most_exact(fit, again, lit)
-            return replace(lit, reason=f"without what may be on a shadow, {lit.reason}")
+            twice_sure = fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit)
+            words = f"without what may be on a shadow, {lit.reason}"
+            return replace(lit, verdict="ambiguous" if twice_sure else "ok", reason=words)
         if not many:
             return all_told
         if share < SHADOWS and (_doubtful(again) or (lit.verdict == "ok" and contradicts(lit, again))):

@@ -316,7 +316,7 @@ def test_two_sure_joints_with_and_without_shadows_that_contradict_each_other_are
 
     def ask(some):
         left_out = int((~some.visible.any(1)).sum())
-        return made(by_itself, turn, 0.1, number[45:110]) if left_out == 45 else made("ok", turn, 0.05, number[90:130])
+        return made(by_itself, turn, 0.1, number[45:110]) if left_out == 45 else made("ok", turn, 0.05, number[90:110])
 
     fit = unless_a_shadow(made("ok", 0.0, 0.08, number[:100]), scene.video, tracks, ask)
     assert (fit.verdict, fit.residual_px) == (verdict, px)
