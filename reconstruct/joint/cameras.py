@@ -129,9 +129,10 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
     """A hinge and slides between two camera paths: starts for the bundle adjustment, in the static body's frame.
 
     With X = ratio * X_link in the first camera's frame, the link moves by D_t = R_t' A_t and
-    d_t = R_t' (ratio a_t - t_t). A hinge has d_t = (I - D_t) c: linear in c and the ratio. Frames that do not show both
-    bodies have no say; their states are between those around. A slide's ratio is the one by which its path is
-    straightest, or shortest: a hundredth more of the camera's path would hide a stroke of a hundredth.
+    d_t = R_t' (ratio a_t - t_t). A hinge has d_t = (I - D_t) c: linear in c and the ratio, which is 1 where none is
+    found. Frames that do not show both bodies have no say; their states are between those around. A slide's ratio is
+    the one by which its path is straightest, or shortest: a hundredth more of the camera's path would hide a stroke of
+    a hundredth.
 
     Args:
         static, link: the two bodies, with T frames each and in units of their own.
@@ -166,7 +167,7 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
     ratio = v[3]
     if ratio <= LEAST_RATIO:  # hidden by what the paths have drifted: parts of one object are about as far away
         ratio = 1.0
-        v = np.append(np.linalg.lstsq(sides[:, :3] * w[:, None], (b - ratio * sides[:, 3]) * w, rcond=None)[0], ratio)
+        v = np.linalg.lstsq(sides[:, :3] * w[:, None], (b - ratio * sides[:, 3]) * w, rcond=None)[0]
     middle = ratio * np.median(points, axis=0)
     point = v[:3] - axis * ((v[:3] - middle) @ axis)
     if np.linalg.norm(middle - point) > 1e-6:

@@ -523,7 +523,8 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         log_odds_hinge(hinge.twist, curvature, size, gain)
         for gain in (_gain(hinge, slide, sight), _cost_gain(hinge, slide, sight), 0.0)
     )
-    z, most = _votes(hinge, slide, sight), _majority(hinge, slide, sight)
+    costs, near_each_other = _costs(hinge, slide, sight), clusters(hinge, sight.link, VOTERS)
+    z, most = votes(*costs, near_each_other), majority(*costs, near_each_other)
     few = z < FEW_SPEAK[0] and most < FEW_SPEAK[1]
     if odds > 0 > alone and few and turn_deg(hinge) < BENT_DEG:
         # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is.
@@ -560,10 +561,6 @@ def _costs(one: Bundle, other: Bundle, sight: Sightings) -> tuple[np.ndarray, np
 
 def _votes(one: Bundle, other: Bundle, sight: Sightings) -> float:
     return votes(*_costs(one, other, sight), clusters(one, sight.link, VOTERS))
-
-
-def _majority(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    return majority(*_costs(one, other, sight), clusters(one, sight.link, VOTERS))
 
 
 def _gain(one: Bundle, other: Bundle, sight: Sightings) -> float:

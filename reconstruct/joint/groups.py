@@ -110,6 +110,10 @@ def begun_beside(uv: np.ndarray, focal: float, body: Rigid, other: Rigid, asked:
 
     Bodies with a joint between them go nearly alike before a camera that goes round both, and the path before one of
     them may have come to rest beside its optimum (a flatter body that turns more).
+
+    Args:
+        uv: (N, T, 2) px from the principal point, NaN where not seen.  focal: px.
+        asked: (N,) bool, tracks that may be in it.
     """
     new = regrown(uv, focal, replace(other, members=body.members), body.members)
     # Held against its own tracks: what it could take from the other body would not tell which path is right.

@@ -119,7 +119,7 @@ def probabilities(log_odds: dict[str, float]) -> dict[str, float]:
 
 def or_by_prior(probability: dict[str, float]) -> dict[str, float]:
     """Probabilities of the types where what they were judged by is as likely no joint's motion at all, and says nothing
-    of one then."""
+    of one then: the mean of either and the prior."""
     total = sum(PRIOR[k] for k in probability)
     return {k: (p + PRIOR[k] / total) / 2 for k, p in probability.items()}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruct.cues import ProviderInfo, Tracks
-from reconstruct.joint.models import joint_transform
+from reconstruct.joint.models import JointFit, joint_transform
 from reconstruct.video import Video
 
 W, H, FOCAL = 960, 540, 768.0
@@ -34,6 +34,14 @@ def make_video(frames: int) -> Video:
 
 def project(xyz: np.ndarray) -> np.ndarray:
     return xyz[..., :2] / xyz[..., 2:] * FOCAL + [(W - 1) / 2, (H - 1) / 2]
+
+
+def made(verdict: str, degrees: float, residual_px: float, ids, std: float = 2.0, count: int | None = None,
+         kind: str = "revolute") -> JointFit:  # fmt: skip
+    """A joint of some tracks whose axis is so far off x, stated to `std` deg; `count` of them agree, all when None."""
+    axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+    return JointFit(verdict, "made", kind, axis=axis, T_camera_world=np.eye(4), std={"axis_deg": std}, point_track=ids,
+                    residual_px=residual_px, inliers=len(ids) if count is None else count)  # fmt: skip
 
 
 def make_scene(kind: str, axis, point, size, q_end: float, frames: int = 60, points: int = 90, impostors: int = 60,

@@ -11,7 +11,7 @@ from reconstruct.cues import Hands, ProviderInfo
 from reconstruct.joint.edges import on_one_edge, unless_one_edge
 from reconstruct.joint.models import JointFit
 from reconstruct.pipeline import joint_off_the_arm
-from tests.reconstruct.joint_scenes import make_scene
+from tests.reconstruct.joint_scenes import made, make_scene
 
 
 def door():
@@ -57,26 +57,21 @@ def test_what_an_edge_alone_follows_is_no_sure_joint(found, turn, verdict, type_
     uv[40:80, :, 1] = 350 - np.arange(T)
     tracks = with_places(scene, uv)
 
-    def made(verdict, degrees, ids, kind):
-        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
-        return JointFit(verdict, "made", kind, axis=axis, T_camera_world=np.eye(4), std={"axis_deg": 2.0},
-                        point_track=ids, residual_px=0.1, inliers=len(ids))  # fmt: skip
-
-    first = made("ok", 0.0, np.arange(40), "revolute" if verdict == "ok" else "prismatic")
+    first = made("ok", 0.0, 0.1, np.arange(40), kind="revolute" if verdict == "ok" else "prismatic")
     asked = []
 
     def ask(some):
         asked.append(some)
         if found == "refused":
             return JointFit("refused", "nothing moves")
-        return made("ok", turn, np.arange(40, 80) if found == "on another edge" else np.arange(40, 120), "revolute")
+        return made("ok", turn, 0.1, np.arange(40, 80) if found == "on another edge" else np.arange(40, 120))
 
     fit = unless_one_edge(first, scene.video, tracks, ask)
     assert (fit.verdict, fit.type) == (verdict, type_)
     assert fit.reason.startswith(words)
     assert len(asked) == 1 and not asked[0].visible[:40].any() and asked[0].visible[40:].all()
     # The pipeline asks so too; a joint of a face is not asked again.
-    face = made("ok", 0.0, np.arange(40, 120), "revolute")
+    face = made("ok", 0.0, 0.1, np.arange(40, 120))
     assert unless_one_edge(face, scene.video, tracks, ask) is face
     answers = iter([first, ask(tracks)])
     monkeypatch.setattr("reconstruct.joint.fit.fit_joint", lambda *_, **__: next(answers))

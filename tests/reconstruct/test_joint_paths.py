@@ -19,7 +19,7 @@ from reconstruct.joint.shadows import maybe_shadows, unless_a_shadow
 from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
 from reconstruct.providers.shade import one_colour, rest_beneath
-from tests.reconstruct.joint_scenes import make_scene
+from tests.reconstruct.joint_scenes import made, make_scene
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
 
@@ -236,14 +236,9 @@ def test_a_joint_that_is_another_without_some_shadows_is_doubtful(
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     cast = np.arange(len(scene.tracks.uv)) < 30
 
-    def made(verdict, degrees, residual_px, std, count):
-        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
-        return JointFit(verdict, "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": std},
-                        point_track=np.arange(100), residual_px=residual_px, inliers=count)  # fmt: skip
-
     tracks = replace(scene.tracks, cast=cast, shade=np.zeros(len(cast), bool))
-    again = made(by_itself, turn, misses, std, lit_count)
-    fit = unless_a_shadow(made("ok", 0.0, 0.1, 1.0, 100), scene.video, tracks, lambda _: again)
+    again = made(by_itself, turn, misses, np.arange(100), std, lit_count)
+    fit = unless_a_shadow(made("ok", 0.0, 0.1, np.arange(100), 1.0), scene.video, tracks, lambda _: again)
     assert (fit.verdict, fit.residual_px) == (verdict, px)
     assert fit.reason.startswith(words)
 
@@ -257,15 +252,11 @@ def test_a_joint_that_fewer_tracks_confirm_stays(turn, std, px, words):
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     cast = np.arange(len(scene.tracks.uv)) < 30
 
-    def made(degrees, residual_px, std):
-        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
-        return JointFit("ok", "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": std},
-                        point_track=np.arange(100), residual_px=residual_px, inliers=100)  # fmt: skip
-
     tracks = replace(scene.tracks, cast=cast, shade=np.arange(len(cast)) < 60)
-    without = {30: made(0.0, 0.1, 4.0), 60: made(turn, 0.05, std)}
+    all_tracks = np.arange(100)
+    without = {30: made("ok", 0.0, 0.1, all_tracks, 4.0), 60: made("ok", turn, 0.05, all_tracks, std)}
     left_out = lambda tracks: int((~tracks.visible.any(1)).sum())  # noqa: E731
-    fit = unless_a_shadow(made(0.0, 0.1, 4.0), scene.video, tracks, lambda t: without[left_out(t)])
+    fit = unless_a_shadow(made("ok", 0.0, 0.1, all_tracks, 4.0), scene.video, tracks, lambda t: without[left_out(t)])
     assert (fit.verdict, fit.residual_px) == ("ok", px)
     assert fit.reason.startswith(words)
 
@@ -285,11 +276,6 @@ def test_of_a_joint_that_was_mostly_a_shadow_some_more_that_may_be_one_makes_it_
     shade = (number < 45) | ((125 <= number) & (number < 140))
     tracks = replace(scene.tracks, cast=number < 45, shade=shade)
 
-    def made(verdict, degrees, residual_px, ids):
-        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
-        return JointFit(verdict, "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": 2.0},
-                        point_track=ids, residual_px=residual_px, inliers=len(ids))  # fmt: skip
-
     def ask(some):
         left_out = int((~some.visible.any(1)).sum())
         return made("ok", 0.0, 0.1, number[60:140]) if left_out == 45 else made(lit, turn, 0.05, number[60:125])
@@ -308,11 +294,6 @@ def test_two_sure_joints_with_and_without_shadows_that_contradict_each_other_are
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     number = np.arange(len(scene.tracks.uv))
     tracks = replace(scene.tracks, cast=number < 45, shade=number < 90)
-
-    def made(verdict, degrees, residual_px, ids):
-        axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
-        return JointFit(verdict, "made", "revolute", axis=axis, T_camera_world=np.eye(4), std={"axis_deg": 2.0},
-                        point_track=ids, residual_px=residual_px, inliers=len(ids))  # fmt: skip
 
     def ask(some):
         left_out = int((~some.visible.any(1)).sum())

@@ -210,8 +210,8 @@ def test_where_the_votes_are_against_the_odds_the_side_of_most_neighbourhoods_le
     near = replace(truth, kind="revolute", twist=replace(truth.twist, curvature=2.0 * across))
     best = {"prismatic": polish(truth, s), "revolute": polish(near, s, iterations=60)}
     assert type_probabilities(best, s, [near])["prismatic"] > 0.9
-    monkeypatch.setattr("reconstruct.joint.finish._votes", lambda *_: -1.0)
-    monkeypatch.setattr("reconstruct.joint.finish._majority", lambda *_: most)
+    monkeypatch.setattr("reconstruct.joint.finish.votes", lambda *_: -1.0)
+    monkeypatch.setattr("reconstruct.joint.finish.majority", lambda *_: most)
     p = type_probabilities(best, s, [near])
     assert max(p, key=lambda kind: p[kind]) == leads
     assert p[leads] < 0.9
