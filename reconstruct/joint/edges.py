@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.cues import Tracks
+from reconstruct.joint.answers import contradicts
 from reconstruct.joint.models import JointFit
-from reconstruct.joint.shadows import contradicts, without
+from reconstruct.joint.shadows import without
 from reconstruct.video import Video
 
 NEAR_PX = 2.0

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from reconstruct.cues import Tracks
+from reconstruct.joint.answers import better_known
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import free_motion
@@ -41,7 +42,7 @@ from reconstruct.joint.select import (
     worth,
 )
 from reconstruct.joint.slight import slight_motion
-from reconstruct.joint.sweep import SMALL, sweep
+from reconstruct.joint.sweep import SMALL, placed_on, sweep
 from reconstruct.video import Video
 
 MOVING_SHARE = 0.012
@@ -58,6 +59,7 @@ NO_LINK = "no joint: the points of the tracks that agree with the best one are t
 NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
 APART = "the camera moves, and hardly any frame shows the scene and the part together"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
+STRAYS = "most of what leaves its place does not follow it"
 ALONE = "all that is followed moves as one body: the camera may go round it as well as the part may turn"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
@@ -78,6 +80,8 @@ PARTS = (slice(0, 7), slice(3, 10))
 the picture holds a point: these lose a door that is seen on edge, and go on saying where it is."""
 PART_TURN_DEG = 30.0
 """Turn from which a hinge is believed of a part of the motion: over a short way every motion turns about something."""
+SHARED = 0.5
+"""Of the tracks of a doubtful joint, the share that another's have to hold, to be the same motion's."""
 LUCKIER, SHARPER = 1.1, 3.0
 """What a later draw, or another stretch of the video, has to explain more than those before it; or, if a draw explains
 no less, how many times less its points have to miss the joint by."""
@@ -125,7 +129,7 @@ def fit_joint(
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
             return fit or JointFit("refused", NO_SCENE, tracks=len(paths))
-    answer, most, sigma = None, 0.0, np.nan
+    answer, before, most, sigma = None, None, 0.0, np.nan
     for k in range(TRIES):
         draw = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES))
         fit = draw.fit
@@ -133,7 +137,7 @@ def fit_joint(
         # less by far more exactly.
         sharp = draw.explained > most and SHARPER * draw.sigma < sigma
         if fit.verdict != "refused" and (draw.explained > LUCKIER * most or sharp):
-            answer = fit
+            answer, before = fit, draw.done
             break
         answer = answer or fit
         if draw.explained > most:
@@ -141,8 +145,12 @@ def fit_joint(
         if fit.inliers == 0:
             break  # this was no bad luck: there is nothing to draw from
     assert answer is not None
-    if answer.verdict == "refused" and answer.inliers < MIN_INLIERS and video.warp is None:
-        answer = _slight(video, paths - camera.centre, camera, view, known) or answer
+    doubtful = answer.verdict == "ambiguous"
+    if video.warp is None and (doubtful or (answer.verdict == "refused" and answer.inliers < MIN_INLIERS)):
+        slight = _slight(video, paths - camera.centre, camera, view, known, pictures, before)
+        if slight is not None and doubtful:
+            slight = better_known(slight, answer)
+        answer = slight or answer
     elif answer.verdict == "refused" and tracks.slip is None:
         answer = _of_a_part(video, paths, camera, view, known, rng, pictures) or answer
     tell(1.0)
@@ -179,18 +187,40 @@ def _of_a_part(video: Video, paths: Paths, camera: _Camera, view: View, known: f
     return None
 
 
-def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None) -> JointFit | None:
-    """The joint of a motion of few pixels, or None if there is none to believe; px from the principal point."""
-    if (found := slight_motion(paths, view)) is None:
+def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, pictures: Pictures | None,
+            before: Finished | None) -> JointFit | None:  # fmt: skip
+    """The joint of a motion of few pixels, or None if there is none to believe; px from the principal point.
+
+    Args:
+        before: a doubtful joint, which competes: there is none to believe unless more tracks follow, most of its own
+            among them.
+    """
+    if (found := slight_motion(paths, view, None if before is None else len(before.members))) is None:
         return None
+    starts, ids, together = found
+    if before is not None:
+        if not _more(ids, before.members):
+            return None
+        every = view.sightings(paths[ids], np.arange(paths.uv.shape[1]), lasting=100.0)
+        starts.setdefault(before.bundle.kind, []).append(placed_on(before.bundle, every))
     try:
-        done = finish(found[0], paths, found[1], view)
+        done = finish(starts, paths, ids, view)
     except NoLink:
         return None
     if why_not_believed(done, _restlessness(paths, camera, 0.5)):
         return None
-    full, std = camera.focal / video.scale, KNOWN_STD if known else None
-    return result_of(video, done, full, len(paths), "; the motion is slight", std)
+    if before is not None and not _more(done.members, before.members):
+        return None
+    note = "; the motion is slight"
+    if pictures is not None and (exact := by_faces(done, pictures)) is not done:
+        done, note = exact, f"{note}; its faces' pixels hold the axis"
+    fit = result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
+    return fit if together else replace(fit, verdict="ambiguous", reason=f"{fit.reason}; {STRAYS}")
+
+
+def _more(ids: np.ndarray, than: np.ndarray) -> bool:
+    """Whether these are more tracks, most of the others among them."""
+    return len(ids) > len(than) and np.isin(than, ids).mean() > SHARED
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
@@ -237,7 +267,7 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
         done, note = exact, f"{note}; its faces' pixels hold the axis"
     full = camera.focal / video.scale
     fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
-    return _Draw(fit, found.explained, done.bundle.sigma)
+    return _Draw(fit, found.explained, done.bundle.sigma, done)
 
 
 def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:
@@ -279,11 +309,13 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
 
 @dataclass(frozen=True)
 class _Draw:
-    """fit: joint or refusal.  explained: motion of all tracks.  sigma: px, noise of its own, NaN without a joint."""
+    """fit: joint or refusal, and done, what a joint is made of.  explained: motion of all tracks.  sigma: px, noise of
+    its own, NaN without a joint."""
 
     fit: JointFit
     explained: float
     sigma: float
+    done: Finished | None = None
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruct.cues import Tracks
+from reconstruct.joint.answers import contradicts
 from reconstruct.joint.fit import moving_tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
@@ -32,8 +33,6 @@ SHARPER = 2.0
 """How many times less a joint's tracks have to miss it by without the edges of some shadows."""
 FEW = 0.25
 """Of the tracks that follow a joint, the share that another has to be followed by to be the more exact one."""
-APART_STDS = 2.0
-"""Standard deviations of their axes by which two joints contradict each other."""
 BESIDE_PX = 10.0
 """Working px within which a track is on the shadow of which another is on the edge: the windows of both see it."""
 
@@ -53,7 +52,8 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     """The joint, or where many of its tracks are on shadows, what is found without these.
 
     First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
-    that its tracks follow far more exactly, and any that contradicts the joint makes it doubtful. Then without all that
+    that its tracks follow far more exactly, or any where nothing was found, and any that contradicts the joint makes it
+    doubtful. Then without all that
     may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly,
     unless it confirms the joint and knows the axis no better. It is asked so as well where much of the joint was on
     edges and some of what is left may be; any sure answer that contradicts it makes the joint doubtful. What counts is
@@ -62,7 +62,9 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
-    refused where it is doubtful besides. Of doubtful ones the one counts that its tracks follow most exactly.
+    refused where it is doubtful besides. Nothing is refused where one of the same type is found without all that may be
+    on a shadow, however doubtful: a part beside its own shadow. Of doubtful ones the one counts that its tracks follow
+    most exactly.
 
     Args:
         fit: the joint of all these tracks, or a refusal.
@@ -73,16 +75,18 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if tracks.cast is None or not len(agree) or np.mean(cast := tracks.cast[agree]) < HARDLY_SHADOWS:
         return fit
     many = np.mean(cast) >= SOME_SHADOWS
-    if not many and (refused or _grey(tracks)):
+    if not many and _grey(tracks):
         return fit
-    again = ask(without(tracks, tracks.cast))
-    if not many:
-        if _sharper(again, fit, SHARPER):
-            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
-        all_told = _most_exact(fit, again, again) if contradicts(again, fit) else fit
+    again = uncast = ask(without(tracks, tracks.cast))
+    if refused and not many and again.verdict != "ok":
+        return fit
+    some = not many and not refused
+    if some:
+        if _sharper(uncast, fit, SHARPER):
+            return replace(uncast, reason=f"without what is on a shadow's edge, {uncast.reason}")
         again = fit
+    may = maybe_shadows(video, tracks)
     if again.verdict != "refused":
-        may = maybe_shadows(video, tracks)
         share = 0.0 if _grey(tracks) else np.mean(may[again.point_track])
         asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
         lit = ask(without(tracks, may)) if asked else again
@@ -91,23 +95,25 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
             twice_sure = fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit)
             words = f"without what may be on a shadow, {lit.reason}"
             return replace(lit, verdict="ambiguous" if twice_sure else "ok", reason=words)
-        if not many:
-            return all_told
+        if some:
+            told = _doubtful(fit) or contradicts(uncast, fit)
+            return _most_exact(fit, uncast, lit if asked else uncast) if told else fit
         if share < SHADOWS and (_doubtful(again) or (lit.verdict == "ok" and contradicts(lit, again))):
             return _most_exact(fit, again, lit)
         if share < SHADOWS or confirmed:
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
         words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
         if again.verdict != "ok":
+            if lit.type == again.type == fit.type:
+                return _most_exact(fit, again, lit)
             return _refuse(again, f"{words}, and {_first(again.reason)}")
         return replace(again, verdict="ambiguous", reason=f"what moves may be a shadow: {words}; {again.reason}")
     if refused:
         return fit
     words = f"{int(cast.sum())} of the {len(agree)} tracks that agree lie on the edge of one"
-    if np.mean(cast) >= SHADOWS:
-        return _refuse(fit, words)
-    if fit.verdict != "ok":
-        return _refuse(fit, f"{words}, and {_first(fit.reason)}")
+    nearly_all = np.mean(cast) >= SHADOWS
+    if (nearly_all or fit.verdict != "ok") and ask(without(tracks, may)).type != fit.type:
+        return _refuse(fit, words if nearly_all else f"{words}, and {_first(fit.reason)}")
     return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
 
 
@@ -148,19 +154,6 @@ def _confirms(other: JointFit, joint: JointFit) -> bool:
 
 def _doubtful(joint: JointFit) -> bool:
     return joint.verdict == "ambiguous"
-
-
-def contradicts(one: JointFit, other: JointFit) -> bool:
-    """Whether two joints are of different types, or their axes further apart than both say they may be."""
-    if "refused" in (one.verdict, other.verdict):
-        return False
-    if one.type != other.type:
-        return True
-    if one.axis is None or other.axis is None or one.std is None or other.std is None:
-        return False
-    axes = [x.axis @ x.T_camera_world[:3, :3].T for x in (one, other)]
-    apart = np.degrees(np.arccos(min(1.0, abs(float(axes[0] @ axes[1])))))
-    return bool(apart > APART_STDS * np.hypot(one.std["axis_deg"], other.std["axis_deg"]))
 
 
 def _most_exact(fit: JointFit, again: JointFit, lit: JointFit) -> JointFit:

@@ -20,31 +20,34 @@ SMOOTH = 5
 LEAST_PX, LEAST_SIGMAS = 2.0, 6.0
 """Extent of the averaged path from which on a track may move, working px, and over its own noise."""
 TOGETHER = 0.5
-"""Share of these that has to follow the joint: resting texture that wanders follows none."""
+"""Share of these that has to follow the joint, to be sure of it: resting texture that wanders follows none."""
 HINGES, SLIDES = 2, 1
 """Different ways to move that are handed on."""
 
 
-def slight_motion(paths: Paths, view: View) -> tuple[dict[str, list[Bundle]], np.ndarray] | None:
+def slight_motion(paths: Paths, view: View, least: int | None = None
+                  ) -> tuple[dict[str, list[Bundle]], np.ndarray, bool] | None:  # fmt: skip
     """The joints that most of the tracks follow which leave their place at all, as their velocities show them.
 
     Args:
         paths: N tracks, px from the principal point.  view: focal length; the camera rests.
+        least: how many have to follow, where another joint is known; TOGETHER of them when None.
 
     Returns:
-        Starts of each type in all frames, and (n,) the tracks that follow the best of them; None if there are too few
-        of these, or most follow no joint.
+        Starts of each type in all frames, (n,) the tracks that follow the best of them, and whether these are TOGETHER
+        of all that leave their place; None if there are too few of these, or too few follow any joint.
     """
     pool = np.flatnonzero(_leaves(paths))
     if len(pool) < FEWEST or (flow := flow_of(paths[pool], view.focal)) is None:
         return None
     ways = candidates(flow, HINGES, SLIDES)
-    if not ways or (good := ways[0].good).sum() < max(FEWEST, TOGETHER * len(pool)):
+    most = TOGETHER * len(pool)
+    if not ways or (good := ways[0].good).sum() < max(FEWEST, most if least is None else least):
         return None
     starts: dict[str, list[Bundle]] = {}
     for way in ways:
         starts.setdefault(way.kind, []).append(start_of(way, flow, np.flatnonzero(good), np.arange(paths.uv.shape[1])))
-    return starts, pool[flow.ids[good]]
+    return starts, pool[flow.ids[good]], bool(good.sum() >= most)
 
 
 def _leaves(paths: Paths) -> np.ndarray:

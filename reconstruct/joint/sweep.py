@@ -81,7 +81,7 @@ def sweep(
             break
         pick = good[_evenly(len(good), TRACKS)]
         sight = view.sightings(paths[pool[flow.ids[pick]]], keys, lasting=100.0)
-        several = _narrowed([start_of(c, flow, pick, keys) for c in ways] + [_placed(b, sight) for b in field], sight)
+        several = _narrowed([start_of(c, flow, pick, keys) for c in ways] + [placed_on(b, sight) for b in field], sight)
         lead = several[0]
         if found is not None and lead.sigma > SHARPER * found[0].sigma:
             break
@@ -105,7 +105,7 @@ def sweep(
         first = starts.setdefault(b.kind, [])
         if not first or (b.cost < RIVAL * found[0].cost and len(first) < RIVALS):
             # Every joint has its own points: those of another would lead it into that one's optimum.
-            first.append(states_of_all_frames(_placed(b, sight), every, keys))
+            first.append(states_of_all_frames(placed_on(b, sight), every, keys))
     return Swept(starts, pool)
 
 
@@ -125,8 +125,8 @@ def start_of(c: Candidate, flow: Flow, pick: np.ndarray, keys: np.ndarray) -> Bu
     return Bundle(c.kind, twist, q, (X - anchor) @ back[0].T + anchor + shift[0])
 
 
-def _placed(b: Bundle, sight: Sightings) -> Bundle:
-    """The joint with points of other tracks."""
+def placed_on(b: Bundle, sight: Sightings) -> Bundle:
+    """The joint with points of other tracks, of which the sightings are in its frames."""
     return place_points(replace(b, X=np.tile(np.median(b.X, axis=0), (len(sight.uv), 1))), sight)
 
 

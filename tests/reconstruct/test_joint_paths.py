@@ -181,7 +181,8 @@ def test_under_a_shadow_the_grain_stays_and_under_a_part_of_that_colour_it_does_
     (60, "off", "ok", 80, "ambiguous", "what moves may be a shadow: without the edges of one, 83% of the tracks"),
     (60, "off", "ok", 70, "ok", "without what is on a shadow's edge, made"),
     (60, "lit", "ambiguous", 70, "ambiguous", "without what is on a shadow's edge, made"),
-    (60, "lit", "ambiguous", 80, "refused", "what moves is a shadow: without the edges of one, 83% of the tracks"),
+    (60, "lit", "ambiguous", 80, "ambiguous", "without what is on a shadow's edge, made"),
+    (60, "off", "ambiguous", 80, "refused", "what moves is a shadow: without the edges of one, 83% of the tracks"),
     (80, "lit", "ok", 30, "ok", "made"),
     (80, "lit", "ok", 60, "ok", "without what may be on a shadow, made"),
     (80, "off", "ok", 60, "ok", "made"),
@@ -374,3 +375,43 @@ def test_a_point_far_before_or_behind_the_link_is_not_handed_on():
     X[:3] *= [[30.0], [1e4], [-1.0]]
     kept = stay(replace(truth, X=X), s)
     assert not kept[:3].any() and kept[3:].all()
+
+
+def beside_shadows(fit, without):
+    """What becomes of a joint of tracks 0 to 99 (0 to 59) of which 30 are on shadows' edges and 30 more may be.
+
+    Args:
+        without: the joints that are found without so many tracks.
+    """
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    cast = np.arange(len(scene.tracks.uv)) < 30
+    tracks = replace(scene.tracks, cast=cast, shade=np.arange(len(cast)) < 60)
+    return unless_a_shadow(fit, scene.video, tracks, lambda t: without[int((~t.visible.any(1)).sum())])
+
+
+NOTHING = JointFit("refused", "nothing moves")
+
+
+@pytest.mark.parametrize(("verdict", "after"), [("ok", "ok"), ("ambiguous", "refused")])
+def test_what_is_refused_beside_some_shadows_is_asked_without_them(monkeypatch, verdict, after):
+    monkeypatch.setattr("reconstruct.joint.shadows.moving_tracks", lambda *_: np.arange(100))
+    found = made(verdict, 0.0, 0.1, np.arange(60, 100), 1.0)
+    fit = beside_shadows(NOTHING, {30: found, 60: found})
+    assert fit.verdict == after
+    assert fit.reason == ("without what is on a shadow's edge, made" if after == "ok" else "nothing moves")
+
+
+def test_of_joints_that_are_all_doubtful_the_one_that_its_tracks_follow_best_counts():
+    doubtful = {px: made("ambiguous", 10.0, px, np.arange(100), 20.0) for px in (0.05, 0.06, 0.1, 0.2)}
+    fit = beside_shadows(doubtful[0.1], {30: doubtful[0.06], 60: doubtful[0.05]})
+    assert (fit.verdict, fit.residual_px) == ("ambiguous", 0.05)
+    fit = beside_shadows(doubtful[0.05], {30: doubtful[0.1], 60: doubtful[0.2]})
+    assert (fit.verdict, fit.residual_px) == ("ambiguous", 0.05)
+
+
+@pytest.mark.parametrize(("kind", "verdict"), [("revolute", "ambiguous"), ("prismatic", "refused")])
+def test_a_part_beside_its_own_shadow_is_not_refused_where_the_same_type_is_found_without(kind, verdict):
+    fit = made("ambiguous", 0.0, 0.1, np.arange(60), 20.0)
+    lit = made("ambiguous", 30.0, 0.05, np.arange(60, 70), 60.0, kind=kind)
+    got = beside_shadows(fit, {30: NOTHING, 60: lit})
+    assert got.verdict == verdict and "a shadow: 30 of the 60 tracks" in got.reason

@@ -1,11 +1,18 @@
 """Motions of a few pixels: found because many tracks go together, and not where they do not."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from reconstruct.joint import fit as fitting
+from reconstruct.joint.answers import better_known
 from reconstruct.joint.finish import View
 from reconstruct.joint.flow import flow_of
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.slight import _leaves, slight_motion
+from tests.reconstruct import joint_scenes
+from tests.reconstruct.joint_scenes import made, make_scene
 from tests.reconstruct.test_joint_flow import FOCAL, tracks
 
 FRAMES = 60
@@ -39,7 +46,8 @@ def test_a_slide_of_four_pixels_is_found_among_strays():
     uv, axis = lifted()
     found = slight_motion(Paths(uv), View(FOCAL))
     assert found is not None
-    starts, ids = found
+    starts, ids, together = found
+    assert together
     assert np.mean(ids < 120) > 0.95 and np.sum(ids < 120) > 90
     slide = starts["prismatic"][0]
     assert slide.q.shape == (FRAMES,) and len(slide.X) == len(ids)
@@ -60,3 +68,49 @@ def test_frames_in_which_only_strays_are_seen_have_no_say_in_the_path():
     assert np.sum(flow.ids < 120) > 100
     path = np.sin(np.linspace(0, 0.7 * np.pi, FRAMES))[:30]
     assert abs(np.corrcoef(flow.path[:30], path)[0, 1]) > 0.97
+
+
+def test_fewer_than_most_are_heard_where_another_joint_is_known():
+    uv, _ = lifted(strays=200)
+    assert slight_motion(Paths(uv), View(FOCAL)) is None
+    found = slight_motion(Paths(uv), View(FOCAL), least=60)
+    assert found is not None and np.mean(found[1] < 120) > 0.9 and not found[2]
+    assert slight_motion(Paths(uv), View(FOCAL), least=200) is None
+
+
+@pytest.mark.parametrize(("std", "verdict"), [(40.0, "ok"), (0.01, "ambiguous")])
+def test_a_doubtful_joint_of_few_tracks_gives_way_to_one_of_many(monkeypatch, std, verdict):
+    """A door of which the search saw 40 tracks: those that leave their place at all know the axis, unless it did."""
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.02, 0.5], [-0.3, 0.3], [-0.005, 0.005]], 0.3,
+                       points=200, impostors=10, noise=0.3)  # fmt: skip
+    others = (np.arange(len(scene.tracks.uv)) >= 40) & (np.arange(len(scene.tracks.uv)) < 200)
+    draw = fitting._one_draw
+
+    def of_few(video, paths, *rest):
+        found = draw(video, replace(paths, uv=np.where(others[:, None, None], np.nan, paths.uv)), *rest)
+        assert found.done is not None
+        return replace(found, fit=replace(found.fit, verdict="ambiguous", std={**found.fit.std, "axis_deg": std}))
+
+    monkeypatch.setattr(fitting, "_one_draw", of_few)
+    fit = fitting.fit_joint(scene.video, scene.tracks, joint_scenes.FOCAL, 0)
+    assert fit.verdict == verdict
+    assert ("the motion is slight" in fit.reason) == (verdict == "ok")
+    assert (fit.inliers > 100) == (verdict == "ok")
+    if verdict == "ok":
+        away = np.degrees(np.arccos(min(1.0, abs((fit.T_camera_world[:3, :3] @ fit.axis) @ scene.axis))))
+        assert away < 2
+
+
+def test_more_tracks_count_only_with_most_of_the_others_among_them():
+    few = np.arange(20)
+    assert fitting._more(np.arange(5, 60), few)
+    assert not fitting._more(np.arange(15, 60), few)
+    assert not fitting._more(np.arange(18), few)
+
+
+def test_of_two_doubtful_joints_the_one_of_more_tracks_counts_if_it_is_known_as_well():
+    doubtful = made("ambiguous", 60.0, 0.1, np.arange(20), 20.0)
+    assert better_known(made("ok", 50.0, 0.1, np.arange(90), 3.0), doubtful).verdict == "ok"
+    assert better_known(made("ok", 0.0, 0.1, np.arange(90), 3.0), doubtful).verdict == "ambiguous"
+    assert better_known(made("ambiguous", 50.0, 0.1, np.arange(90), 22.0), doubtful).verdict == "ambiguous"
+    assert better_known(made("ok", 50.0, 0.1, np.arange(90), 30.0), doubtful) is None

@@ -1,0 +1,37 @@
+"""Two answers to one question, found in different tracks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruct.joint.models import JointFit
+
+APART_STDS = 2.0
+"""Standard deviations of their axes by which two joints contradict each other."""
+AS_WELL = 1.25
+"""Ratio of what two joints state of their axes up to which these are known alike."""
+
+
+def contradicts(one: JointFit, other: JointFit) -> bool:
+    """Whether two joints are of different types, or their axes further apart than both say they may be."""
+    if "refused" in (one.verdict, other.verdict):
+        return False
+    if one.type != other.type:
+        return True
+    if one.axis is None or other.axis is None or one.std is None or other.std is None:
+        return False
+    axes = [x.axis @ x.T_camera_world[:3, :3].T for x in (one, other)]
+    apart = np.degrees(np.arccos(min(1.0, abs(float(axes[0] @ axes[1])))))
+    return bool(apart > APART_STDS * np.hypot(one.std["axis_deg"], other.std["axis_deg"]))
+
+
+def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
+    """A joint of more tracks if its axis is known no worse than a doubtful one's, else None.
+
+    It is doubtful where the two contradict each other.
+    """
+    if joint.std["axis_deg"] > AS_WELL * than.std["axis_deg"]:
+        return None
+    return replace(joint, verdict="ambiguous") if contradicts(joint, than) else joint
