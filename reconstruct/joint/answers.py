@@ -10,7 +10,7 @@ from reconstruct.joint.models import JointFit
 
 APART_STDS = 2.0
 """Standard deviations of their axes by which two joints contradict each other."""
-AS_WELL = 1.25
+AS_WELL = 1.5
 """Ratio of what two joints state of their axes up to which these are known alike."""
 
 
@@ -28,7 +28,7 @@ def contradicts(one: JointFit, other: JointFit) -> bool:
 
 
 def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
-    """A joint of more tracks if its axis is known no worse than a doubtful one's, else None.
+    """A joint of more tracks if its axis is known no worse than another's of few, else None.
 
     It is doubtful where the two contradict each other.
     """

@@ -80,8 +80,9 @@ PARTS = (slice(0, 7), slice(3, 10))
 the picture holds a point: these lose a door that is seen on edge, and go on saying where it is."""
 PART_TURN_DEG = 30.0
 """Turn from which a hinge is believed of a part of the motion: over a short way every motion turns about something."""
-SHARED = 0.5
-"""Of the tracks of a doubtful joint, the share that another's have to hold, to be the same motion's."""
+SHARED, MANY = 0.5, 2.0
+"""Of the tracks of a joint, the share that another's have to hold, to be the same motion's; and how many times more of
+them stand against a sure one."""
 LUCKIER, SHARPER = 1.1, 3.0
 """What a later draw, or another stretch of the video, has to explain more than those before it; or, if a draw explains
 no less, how many times less its points have to miss the joint by."""
@@ -145,10 +146,10 @@ def fit_joint(
         if fit.inliers == 0:
             break  # this was no bad luck: there is nothing to draw from
     assert answer is not None
-    doubtful = answer.verdict == "ambiguous"
-    if video.warp is None and (doubtful or (answer.verdict == "refused" and answer.inliers < MIN_INLIERS)):
-        slight = _slight(video, paths - camera.centre, camera, view, known, pictures, before)
-        if slight is not None and doubtful:
+    if video.warp is None and (answer.verdict != "refused" or answer.inliers < MIN_INLIERS):
+        sure = answer.verdict == "ok"
+        slight = _slight(video, paths - camera.centre, camera, view, known, pictures, before, sure)
+        if slight is not None and before is not None:
             slight = better_known(slight, answer)
         answer = slight or answer
     elif answer.verdict == "refused" and tracks.slip is None:
@@ -188,18 +189,20 @@ def _of_a_part(video: Video, paths: Paths, camera: _Camera, view: View, known: f
 
 
 def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, pictures: Pictures | None,
-            before: Finished | None) -> JointFit | None:  # fmt: skip
+            before: Finished | None, sure: bool) -> JointFit | None:  # fmt: skip
     """The joint of a motion of few pixels, or None if there is none to believe; px from the principal point.
 
     Args:
-        before: a doubtful joint, which competes: there is none to believe unless more tracks follow, most of its own
-            among them.
+        before: another joint, which competes: there is none to believe unless more tracks follow, most of its own among
+            them.  sure: of it; then MANY times more have to, and most of all that leave their place.
     """
-    if (found := slight_motion(paths, view, None if before is None else len(before.members))) is None:
+    found = slight_motion(paths, view, None if before is None or sure else len(before.members))
+    if found is None:
         return None
     starts, ids, together = found
+    times = MANY if sure else 1.0
     if before is not None:
-        if not _more(ids, before.members):
+        if not _more(ids, before.members, times):
             return None
         every = view.sightings(paths[ids], np.arange(paths.uv.shape[1]), lasting=100.0)
         starts.setdefault(before.bundle.kind, []).append(placed_on(before.bundle, every))
@@ -209,7 +212,7 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         return None
     if why_not_believed(done, _restlessness(paths, camera, 0.5)):
         return None
-    if before is not None and not _more(done.members, before.members):
+    if before is not None and not _more(done.members, before.members, times):
         return None
     note = "; the motion is slight"
     if pictures is not None and (exact := by_faces(done, pictures)) is not done:
@@ -218,9 +221,9 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
     return fit if together else replace(fit, verdict="ambiguous", reason=f"{fit.reason}; {STRAYS}")
 
 
-def _more(ids: np.ndarray, than: np.ndarray) -> bool:
-    """Whether these are more tracks, most of the others among them."""
-    return len(ids) > len(than) and np.isin(than, ids).mean() > SHARED
+def _more(ids: np.ndarray, than: np.ndarray, times: float = 1.0) -> bool:
+    """Whether these are so many times more tracks, most of the others among them."""
+    return len(ids) > times * len(than) and np.isin(than, ids).mean() > SHARED
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
