@@ -52,13 +52,12 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     """The joint, or where many of its tracks are on shadows, what is found without these.
 
     First it is asked for without what is seen to be the edge of one; where that is but some of it, a sure answer counts
-    that its tracks follow far more exactly, or any where nothing was found, and any that contradicts the joint makes it
-    doubtful. Then without all that
-    may be on one, where that is much of what still agrees; a sure answer counts that its tracks follow no less exactly,
-    unless it confirms the joint and knows the axis no better. It is asked so as well where much of the joint was on
-    edges and some of what is left may be; any sure answer that contradicts it makes the joint doubtful. What counts is
-    doubtful too where a sure one with all contradicts it beside a doubtful one. In a grey world only many edges are
-    asked of.
+    that its tracks follow far more exactly, or where nothing was found any that is no shadow's, and any that
+    contradicts the joint makes it doubtful. Then without all that may be on one, where that is much of what still
+    agrees; a sure answer counts that its tracks follow no less exactly, unless it confirms the joint and knows the axis
+    no better. It is asked so as well where much of the joint was on edges and some of what is left may be; any sure
+    answer that contradicts it makes the joint doubtful. What counts is doubtful too where a sure one with all
+    contradicts it beside a doubtful one. In a grey world only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
@@ -102,6 +101,8 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
             return _most_exact(fit, again, lit)
         if share < SHADOWS or confirmed:
             return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+        if refused and not many:
+            return fit
         words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
         if again.verdict != "ok":
             if lit.type == again.type == fit.type:

@@ -392,11 +392,14 @@ def beside_shadows(fit, without):
 NOTHING = JointFit("refused", "nothing moves")
 
 
-@pytest.mark.parametrize(("verdict", "after"), [("ok", "ok"), ("ambiguous", "refused")])
-def test_what_is_refused_beside_some_shadows_is_asked_without_them(monkeypatch, verdict, after):
+@pytest.mark.parametrize(("verdict", "first", "after"), [
+    ("ok", 60, "ok"), ("ambiguous", 60, "refused"),
+    ("ok", 30, "refused"),  # a shadow's
+])  # fmt: skip
+def test_what_is_refused_beside_some_shadows_is_asked_without_them(monkeypatch, verdict, first, after):
     monkeypatch.setattr("reconstruct.joint.shadows.moving_tracks", lambda *_: np.arange(100))
-    found = made(verdict, 0.0, 0.1, np.arange(60, 100), 1.0)
-    fit = beside_shadows(NOTHING, {30: found, 60: found})
+    found = made(verdict, 0.0, 0.1, np.arange(first, first + 30), 1.0)
+    fit = beside_shadows(NOTHING, {30: found, 60: found if first == 60 else NOTHING})
     assert fit.verdict == after
     assert fit.reason == ("without what is on a shadow's edge, made" if after == "ok" else "nothing moves")
 
