@@ -76,44 +76,53 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     many = np.mean(cast) >= SOME_SHADOWS
     if not many and _grey(tracks):
         return fit
-    again = uncast = ask(without(tracks, tracks.cast))
-    if refused and not many and again.verdict != "ok":
+    uncast = ask(without(tracks, tracks.cast))
+    if refused and not many and uncast.verdict != "ok":
         return fit
     some = not many and not refused
-    if some:
-        if _sharper(uncast, fit, SHARPER):
-            return replace(uncast, reason=f"without what is on a shadow's edge, {uncast.reason}")
-        again = fit
+    if some and _sharper(uncast, fit, SHARPER):
+        return replace(uncast, reason=f"without what is on a shadow's edge, {uncast.reason}")
+    again = fit if some else uncast
     may = maybe_shadows(video, tracks)
-    if again.verdict != "refused":
-        share = 0.0 if _grey(tracks) else np.mean(may[again.point_track])
-        asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
-        lit = ask(without(tracks, may)) if asked else again
-        confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
-        if share >= SOME_SHADOWS and not confirmed and _sharper(lit, again):
-            twice_sure = fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit)
-            words = f"without what may be on a shadow, {lit.reason}"
-            return replace(lit, verdict="ambiguous" if twice_sure else "ok", reason=words)
-        if some:
-            told = _doubtful(fit) or contradicts(uncast, fit)
-            return _most_exact(fit, uncast, lit if asked else uncast) if told else fit
-        if share < SHADOWS and (_doubtful(again) or (lit.verdict == "ok" and contradicts(lit, again))):
-            return _most_exact(fit, again, lit)
-        if share < SHADOWS or confirmed:
-            return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
-        if refused and not many:
-            return fit
-        words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
-        if again.verdict != "ok":
-            if lit.type == again.type == fit.type:
-                return _most_exact(fit, again, lit)
-            return _refuse(again, f"{words}, and {_first(again.reason)}")
+    if again.verdict == "refused":
+        return fit if refused else _nothing_without(fit, cast, lambda: ask(without(tracks, may)))
+    share = 0.0 if _grey(tracks) else float(np.mean(may[again.point_track]))
+    asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
+    lit = ask(without(tracks, may)) if asked else again
+    confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
+    if share >= SOME_SHADOWS and not confirmed and _sharper(lit, again):
+        twice_sure = fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit)
+        words = f"without what may be on a shadow, {lit.reason}"
+        return replace(lit, verdict="ambiguous" if twice_sure else "ok", reason=words)
+    if some:
+        told = _doubtful(fit) or contradicts(uncast, fit)
+        return _most_exact(fit, uncast, lit if asked else uncast) if told else fit
+    if share < SHADOWS and (_doubtful(again) or (lit.verdict == "ok" and contradicts(lit, again))):
+        return _most_exact(fit, again, lit)
+    if share < SHADOWS or confirmed:
+        return replace(again, reason=f"without what is on a shadow's edge, {again.reason}")
+    return fit if refused and not many else _mostly_shadows(fit, again, lit, share)
+
+
+def _mostly_shadows(fit: JointFit, again: JointFit, lit: JointFit, share: float) -> JointFit:
+    """What becomes of a joint that is found without the edges of shadows, so much of which may be on them too."""
+    words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
+    if again.verdict == "ok":
         return replace(again, verdict="ambiguous", reason=f"what moves may be a shadow: {words}; {again.reason}")
-    if refused:
-        return fit
-    words = f"{int(cast.sum())} of the {len(agree)} tracks that agree lie on the edge of one"
+    if lit.type == again.type == fit.type:
+        return _most_exact(fit, again, lit)
+    return _refuse(again, f"{words}, and {_first(again.reason)}")
+
+
+def _nothing_without(fit: JointFit, cast: np.ndarray, ask_lit: Callable[[], JointFit]) -> JointFit:
+    """What becomes of a joint that is none without the edges of shadows.
+
+    Args:
+        cast: (n,) bool, which of its tracks are on these.  ask_lit: for what is found without all that may be on one.
+    """
+    words = f"{int(cast.sum())} of the {len(cast)} tracks that agree lie on the edge of one"
     nearly_all = np.mean(cast) >= SHADOWS
-    if (nearly_all or fit.verdict != "ok") and ask(without(tracks, may)).type != fit.type:
+    if (nearly_all or fit.verdict != "ok") and ask_lit().type != fit.type:
         return _refuse(fit, words if nearly_all else f"{words}, and {_first(fit.reason)}")
     return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
 
