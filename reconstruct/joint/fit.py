@@ -214,11 +214,16 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         return None
     if before is not None and not _more(done.members, before.members, times):
         return None
-    note = "; the motion is slight"
-    if pictures is not None and (exact := by_faces(done, pictures)) is not done:
-        done, note = exact, f"{note}; its faces' pixels hold the axis"
+    done, note = _on_faces(done, pictures, "; the motion is slight")
     fit = result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
     return fit if together else replace(fit, verdict="ambiguous", reason=f"{fit.reason}; {STRAYS}")
+
+
+def _on_faces(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
+    """The joint before a resting camera, by its faces where these hold it better, and the words for it."""
+    if pictures is None or (exact := by_faces(done, pictures)) is done:
+        return done, note
+    return exact, f"{note}; its faces' pixels hold the axis"
 
 
 def _more(ids: np.ndarray, than: np.ndarray, times: float = 1.0) -> bool:
@@ -266,8 +271,8 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
         return refused(NO_LINK, found.members)
     if reason := why_not_believed(done, restless):
         return refused(reason, done.members, done.bundle.sigma)
-    if pictures is not None and video.warp is None and (exact := by_faces(done, pictures)) is not done:
-        done, note = exact, f"{note}; its faces' pixels hold the axis"
+    if video.warp is None:
+        done, note = _on_faces(done, pictures, note)
     full = camera.focal / video.scale
     fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
     return _Draw(fit, found.explained, done.bundle.sigma, done)

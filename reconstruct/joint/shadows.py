@@ -83,9 +83,10 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if some and _sharper(uncast, fit, SHARPER):
         return replace(uncast, reason=f"without what is on a shadow's edge, {uncast.reason}")
     again = fit if some else uncast
-    may = maybe_shadows(video, tracks)
     if again.verdict == "refused":
-        return fit if refused else _nothing_without(fit, cast, lambda: ask(without(tracks, may)))
+        ask_lit = lambda: ask(without(tracks, maybe_shadows(video, tracks)))  # noqa: E731
+        return fit if refused else _nothing_without(fit, cast, ask_lit)
+    may = maybe_shadows(video, tracks)
     share = 0.0 if _grey(tracks) else float(np.mean(may[again.point_track]))
     asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
     lit = ask(without(tracks, may)) if asked else again
