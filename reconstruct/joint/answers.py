@@ -24,7 +24,7 @@ def contradicts(one: JointFit, other: JointFit) -> bool:
         return False
     axes = [x.axis @ x.T_camera_world[:3, :3].T for x in (one, other)]
     apart = np.degrees(np.arccos(min(1.0, abs(float(axes[0] @ axes[1])))))
-    return bool(apart > APART_STDS * np.hypot(one.std["axis_deg"], other.std["axis_deg"]))
+    return bool(apart > APART_STDS * np.hypot(alone_deg(one), alone_deg(other)))
 
 
 def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
@@ -32,6 +32,12 @@ def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
 
     It is doubtful where the two contradict each other.
     """
-    if joint.std["axis_deg"] > AS_WELL * than.std["axis_deg"]:
+    if alone_deg(joint) > AS_WELL * alone_deg(than):
         return None
     return replace(joint, verdict="ambiguous") if contradicts(joint, than) else joint
+
+
+def alone_deg(fit: JointFit) -> float:
+    """Standard deviation of an axis by its own tracks: that some direction of the picture's edges fits a joint does not
+    make it the right one of two."""
+    return fit.std.get("axis_deg", np.inf) if fit.alone_deg is None else fit.alone_deg

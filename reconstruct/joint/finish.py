@@ -75,6 +75,10 @@ class NoLink(Exception):
     """The points of the tracks are no one body by any type: too few are before the camera and near each other."""
 
 
+LIKELY = 0.1
+"""Probability of another axis, or type, from which on the answer is not called certain."""
+
+
 @dataclass(frozen=True)
 class Rival:
     """Another axis of the same type that explains the motion too: how far off it is, and its probability."""
@@ -96,6 +100,8 @@ class Finished:
         once: the bundle as one adjustment of all tracks found it, before halves of the link and the tracks without
             strays led to a better one; that where None. A free body is fitted once as well, and is held against this.
         lost: number of frames that show tracks of the link, of which too few agree on a state; 0 for tracks with slip.
+        doubt: why the axis is not certain though its spread is small; "" where it is.
+        alone_deg: what the tracks alone hold the axis to, where edges of the picture gave it; else None.
     """
 
     bundle: Bundle
@@ -107,6 +113,15 @@ class Finished:
     rival: Rival | None = None
     once: Bundle | None = None
     lost: int = 0
+    doubt: str = ""
+    alone_deg: float | None = None
+
+    @property
+    def axis_deg(self) -> float:
+        """Standard deviation of the axis, another one that is as probable included."""
+        if self.rival is None:
+            return self.spread.axis_deg
+        return float(np.hypot(self.spread.axis_deg, np.sqrt(self.rival.probability) * self.rival.apart_deg))
 
 
 @dataclass(frozen=True)
@@ -569,6 +584,11 @@ def _gain(one: Bundle, other: Bundle, sight: Sightings) -> float:
     return a / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(b, 1e-9) / max(a, 1e-9)))
 
 
+def log_odds_of_same_type(one: Bundle, other: Bundle, sight: Sightings) -> float:
+    """Of two joints of one type with the points of the same tracks."""
+    return tempered(_gain(one, other, sight), _votes(one, other, sight))
+
+
 def _refitted(b: Bundle, like: Bundle, sight: Sightings) -> Bundle:
     """The joint with the points of another's tracks."""
     points = np.tile(np.median(b.X, axis=0), (len(like.X), 1))
@@ -584,7 +604,7 @@ def _rival(last: Bundle, others: Sequence[Bundle], sight: Sightings) -> Rival | 
     found: list[Rival] = []
     for b in others:
         if (apart := _apart_deg(b, last)) > APART_DEG:
-            odds = tempered(_gain(last, b, sight), _votes(last, b, sight))
+            odds = log_odds_of_same_type(last, b, sight)
             found.append(Rival(apart, float(expit(-odds))))
     return max(found, key=lambda r: r.probability, default=None)
 

@@ -26,6 +26,7 @@ from reconstruct.joint.groups import Rigid, two_bodies
 from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
+from reconstruct.joint.parallels import along_edges
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.result import MIN_INLIERS, result_of, why_not_believed
@@ -220,10 +221,16 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
 
 
 def _on_faces(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
-    """The joint before a resting camera, by its faces where these hold it better, and the words for it."""
-    if pictures is None or (exact := by_faces(done, pictures)) is done:
+    """The joint before a resting camera, along edges and by its faces where these hold it better, and the words."""
+    if pictures is None:
         return done, note
-    return exact, f"{note}; its faces' pixels hold the axis"
+    if (parallel := along_edges(done, pictures)) is not done:
+        note = f"{note}; the axis is taken along edges in the picture"
+    if (exact := by_faces(parallel, pictures)) is parallel:
+        return parallel, note
+    # Faces say which axis it is, but not which of two that lie far apart.
+    doubt = parallel.doubt if done.rival is not None else ""
+    return replace(exact, doubt=doubt, alone_deg=None), f"{note}; its faces' pixels hold the axis"
 
 
 def _more(ids: np.ndarray, than: np.ndarray, times: float = 1.0) -> bool:

@@ -64,6 +64,7 @@ class JointFit:
         residual_px: median over inlier observations, full px.  inliers, tracks: counts.
         moving_frames: (T,) bool, the frames in which the part moves.
         further: joints of other links of the same object, each on the static one, in the same world and scale.
+        alone_deg: standard deviation of the axis by its tracks alone, where edges of the picture gave it; else None.
     """
 
     verdict: str
@@ -88,6 +89,7 @@ class JointFit:
     tracks: int = 0
     moving_frames: np.ndarray | None = None
     further: tuple[JointFit, ...] = ()
+    alone_deg: float | None = None
 
     @property
     def unit(self) -> str:

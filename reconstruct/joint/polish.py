@@ -33,6 +33,8 @@ REACH = 1.5
 """Link sizes from the middle up to which a point may lie anywhere."""
 HOLDERS = 3
 """Tracks that a frame must show near where the joint has them for its state to be part of the stroke."""
+PARALLEL_DEG = 0.7
+"""Standard deviation of an axis about what it is taken to be parallel to, to either side, for a known focal length."""
 GAUGE = 0.4
 """Logarithm of the link's depth beyond which it is brought back to 1."""
 
@@ -52,6 +54,7 @@ class Sightings:
         relative: (N,) noise over that of the link's tracks; 1 when None.
         free: True if the camera's poses are unknown, R and t but a start; the world is the first camera then.
         slip: (N, T, 2) along what the picture holds badly, see paths.py; None if there is none.
+        along: (3,) unit, world: what the axis is taken to be parallel to; None where nothing is known of it.
     """
 
     uv: np.ndarray
@@ -67,6 +70,7 @@ class Sightings:
     relative: np.ndarray | None = None
     free: bool = False
     slip: np.ndarray | None = None
+    along: np.ndarray | None = None
 
     def of(self, tracks: np.ndarray) -> Sightings:
         """Of some of the tracks of a link."""
@@ -111,6 +115,15 @@ class Bundle:
     sigma: float = 1.0
     R: np.ndarray | None = None
     t: np.ndarray | None = None
+
+
+def parallel_deg(s: Sightings) -> float:
+    """Standard deviation, to either side, of an axis about what it is taken to be parallel to.
+
+    Where edges meet is known in px; a focal length that is wrong by a hundredth turns a direction that is 45 deg from
+    the line of sight by half of that, and the usual one by half of that again.
+    """
+    return float(np.hypot(PARALLEL_DEG, np.degrees(s.focal_std) / 4))
 
 
 def positions(b: Bundle, s: Sightings) -> tuple[np.ndarray, np.ndarray]:
@@ -221,6 +234,7 @@ class _Priors:
         ends: the frames with the least and the most path of those that tracks hold. Measured from the first frame,
             which may show nothing of the link, a hinge would get its radius by a path that nothing contradicts.
         reach: of the link's points.
+        along, parallel: what the axis is parallel to, and the weight of the sine of the angle between them.
     """
 
     focal: float
@@ -229,6 +243,8 @@ class _Priors:
     log_turn: float
     ends: tuple[int, int]
     reach: Reach
+    along: np.ndarray | None = None
+    parallel: float = 0.0
 
     @classmethod
     def of(cls, b: Bundle, s: Sightings, sigma: float, hold: float = 1.0, w: np.ndarray | None = None) -> _Priors:
@@ -245,6 +261,7 @@ class _Priors:
         if w is None:
             w = robust_loss(residuals(b, s), s, ROBUST_SIGMAS * max(sigma, 0.05))[1]
         focal = sigma**2 * s.lasting / s.focal_std**2 if s.focal_std > 0 else 0.0
+        parallel = 0.0 if s.along is None else sigma**2 * s.lasting / np.radians(parallel_deg(s)) ** 2
         held = frames_held(s, w)
         bend = s.bend * (sigma / (BEND * max(float(np.ptp(b.q[held])), 1e-9))) ** 2
         ends = int(held[np.argmin(b.q[held])]), int(held[np.argmax(b.q[held])])
@@ -252,13 +269,15 @@ class _Priors:
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
         reach = Reach.of(b, s, sigma)
         if b.kind == "prismatic" or s.link is not None or path <= 0 or size <= 0:
-            return cls(focal, bend, 0.0, 0.0, ends, reach)
+            return cls(focal, bend, 0.0, 0.0, ends, reach, s.along, parallel)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
-        return cls(focal, bend, radius, float(np.log(path / (HINGE_RADIUS * size))), ends, reach)
+        log_turn = float(np.log(path / (HINGE_RADIUS * size)))
+        return cls(focal, bend, radius, log_turn, ends, reach, s.along, parallel)
 
     def cost(self, b: Bundle) -> float:
         """Without the radius, which is weighed apart where types are compared."""
-        return self.focal * b.log_focal**2 + float(b.q @ self.bend @ b.q)
+        aside = 0.0 if self.along is None else float(np.sum(np.cross(self.along, b.twist.axis) ** 2))
+        return self.focal * b.log_focal**2 + float(b.q @ self.bend @ b.q) + self.parallel * aside
 
     def radius_cost(self, b: Bundle) -> float:
         """Of the radius alone."""
@@ -279,6 +298,10 @@ class _Priors:
             n.g[G] += self.focal * b.log_focal
         n.H[A : A + T, A : A + T] += self.bend
         n.g[A : A + T] += self.bend @ b.q
+        if self.along is not None:
+            J = np.cross(self.along, b.twist.axis_by_step(n.Z), axisb=0).T
+            n.H[:G, :G] += self.parallel * J.T @ J
+            n.g[:G] += self.parallel * J.T @ np.cross(self.along, b.twist.axis)
         H, g = self.reach.slopes(b.X)
         n.Hp[...] += H
         n.gp[...] += g

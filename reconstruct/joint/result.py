@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.joint.evidence import bridged, looser
-from reconstruct.joint.finish import SCREW_TURN_DEG, Finished, turn_deg
+from reconstruct.joint.finish import LIKELY, SCREW_TURN_DEG, Finished, turn_deg
 from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.polish import Bundle, Sightings, positions, residuals
 from reconstruct.joint.uncertainty import compact
@@ -19,8 +19,6 @@ BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
 LOOSER, RESTLESS = 2.75, 3.0
 """A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
 what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
-LIKELY = 0.1
-"""Probability of another axis, or type, from which on the answer is not called certain."""
 SLID_PX = 2.0
 """Working px, median, that a track may have slid along its edge for its point to be handed on."""
 
@@ -93,9 +91,9 @@ def result_of(
             f"{names} explain the motion almost equally well (p = {p:.2f}); a longer motion would tell; {how}{note}"
         )
     sure = done.spread
-    rival, axis_deg = done.rival, sure.axis_deg
-    if rival is not None:
-        axis_deg = float(np.hypot(axis_deg, np.sqrt(rival.probability) * rival.apart_deg))
+    rival, axis_deg = done.rival, done.axis_deg
+    if verdict == "ok" and done.doubt:
+        verdict, reason = "ambiguous", f"{done.doubt}; {how}{note}"
     if verdict == "ok" and rival is not None and rival.probability > LIKELY:
         verdict = "ambiguous"
         reason = (
@@ -132,7 +130,7 @@ def result_of(
         tracks=tracks,
         moving_frames=_moving_frames(q, video.time),
     )
-    return replace(fit, image_line=image_line(fit))
+    return replace(fit, image_line=image_line(fit), alone_deg=done.alone_deg)
 
 
 def stay(b: Bundle, s: Sightings) -> np.ndarray:

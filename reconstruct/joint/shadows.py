@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.answers import contradicts
+from reconstruct.joint.answers import alone_deg, contradicts
 from reconstruct.joint.fit import moving_tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
@@ -160,7 +160,7 @@ def _confirms(other: JointFit, joint: JointFit) -> bool:
     """Whether both are sure of one joint, whose axis the other knows no better."""
     if (other.verdict, joint.verdict) != ("ok", "ok"):
         return False
-    return not contradicts(other, joint) and bool(other.std.get("axis_deg", 0) >= joint.std.get("axis_deg", np.inf))
+    return not contradicts(other, joint) and bool(alone_deg(other) >= alone_deg(joint))
 
 
 def _doubtful(joint: JointFit) -> bool:

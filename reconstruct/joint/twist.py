@@ -109,6 +109,13 @@ class Twist:
         J = a[:, None, None] * np.eye(3) + b[:, None, None] * skew(phi)
         return J + c[:, None, None] * phi[:, :, None] * phi[:, None]
 
+    def axis_by_step(self, steps: np.ndarray) -> np.ndarray:
+        """(3, G) derivatives of the axis by steps (6, G) of direction and curvature."""
+        k = float(np.linalg.norm(self.curvature))
+        if k == 0:
+            return steps[:3]
+        return (np.eye(3) - np.outer(self.axis, self.axis)) @ steps[3:] / k
+
     def tangent(self, kind: str) -> np.ndarray:
         """(6, G) basis of the steps (direction, curvature) that keep |d| = 1 and the kind's constraint."""
         basis = np.zeros((6, 5))

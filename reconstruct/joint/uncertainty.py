@@ -17,6 +17,7 @@ from reconstruct.joint.polish import (
     Sightings,
     frames_held,
     normal_equations,
+    parallel_deg,
     positions,
     residuals,
     robust_loss,
@@ -160,6 +161,9 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     S, _, inv = n.reduced(0.0)
     if s.focal_std > 0:
         S[G, G] += b.sigma**2 * s.lasting / s.focal_std**2
+    if s.along is not None:
+        J = np.cross(s.along, tw.axis_by_step(n.Z), axisb=0).T
+        S[:G, :G] += b.sigma**2 * s.lasting / np.radians(parallel_deg(s)) ** 2 * J.T @ J
     # Gauges: q[0], the first camera, and the scale about its centre.
     S, _ = n.held(S, np.zeros(len(S)), T)
     v0 = tw.direction - np.cross(tw.curvature, tw.anchor)
