@@ -40,4 +40,4 @@ def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
 def alone_deg(fit: JointFit) -> float:
     """Standard deviation of an axis by its own tracks: that some direction of the picture's edges fits a joint does not
     make it the right one of two."""
-    return fit.std.get("axis_deg", np.inf) if fit.alone_deg is None else fit.alone_deg
+    return fit.std["axis_deg"] if fit.alone_deg is None else fit.alone_deg

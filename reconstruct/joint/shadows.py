@@ -160,7 +160,8 @@ def _confirms(other: JointFit, joint: JointFit) -> bool:
     """Whether both are sure of one joint, whose axis the other knows no better."""
     if (other.verdict, joint.verdict) != ("ok", "ok"):
         return False
-    return not contradicts(other, joint) and bool(alone_deg(other) >= alone_deg(joint))
+    known = "axis_deg" in other.std and "axis_deg" in joint.std
+    return known and not contradicts(other, joint) and bool(alone_deg(other) >= alone_deg(joint))
 
 
 def _doubtful(joint: JointFit) -> bool:
