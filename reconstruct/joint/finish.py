@@ -603,13 +603,14 @@ def _rival(last: Bundle, others: Sequence[Bundle], sight: Sightings) -> Rival | 
     """
     found: list[Rival] = []
     for b in others:
-        if (apart := _apart_deg(b, last)) > APART_DEG:
+        if (apart := apart_deg(b, last)) > APART_DEG:
             odds = log_odds_of_same_type(last, b, sight)
             found.append(Rival(apart, float(expit(-odds))))
     return max(found, key=lambda r: r.probability, default=None)
 
 
-def _apart_deg(one: Bundle, other: Bundle) -> float:
+def apart_deg(one: Bundle, other: Bundle) -> float:
+    """Angle between the axes of two joints, 0 to 90 deg."""
     return float(np.degrees(np.arccos(np.clip(abs(one.twist.axis @ other.twist.axis), 0, 1))))
 
 

@@ -215,12 +215,12 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         return None
     if before is not None and not _more(done.members, before.members, times):
         return None
-    done, note = _on_faces(done, pictures, "; the motion is slight")
+    done, note = _by_pixels(done, pictures, "; the motion is slight")
     fit = result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
     return fit if together else replace(fit, verdict="ambiguous", reason=f"{fit.reason}; {STRAYS}")
 
 
-def _on_faces(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
+def _by_pixels(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
     """The joint before a resting camera, along edges and by its faces where these hold it better, and the words."""
     if pictures is None:
         return done, note
@@ -279,7 +279,7 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
     if reason := why_not_believed(done, restless):
         return refused(reason, done.members, done.bundle.sigma)
     if video.warp is None:
-        done, note = _on_faces(done, pictures, note)
+        done, note = _by_pixels(done, pictures, note)
     full = camera.focal / video.scale
     fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
     return _Draw(fit, found.explained, done.bundle.sigma, done)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from reconstruct.joint.finish import LIKELY, Finished, log_odds_of_same_type
+from reconstruct.joint.finish import LIKELY, Finished, apart_deg, log_odds_of_same_type
 from reconstruct.joint.models import VAGUE_DEG
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.polish import (
@@ -220,9 +220,8 @@ def along_edges(done: Finished, pictures: Pictures) -> Finished:
     if k == len(asked):
         return done
     best = asked[k]
-    axis = best.bundle.twist.axis
-    apart = [_apart_deg(axis, a.bundle.twist.axis) for a in asked]
-    apart = np.array([*apart, max(free, _apart_deg(axis, b.twist.axis))])
+    apart = [apart_deg(best.bundle, a.bundle) for a in asked]
+    apart = np.array([*apart, max(free, apart_deg(best.bundle, b))])
     sure = spread(best.bundle, best.sight)
     others = np.sqrt(np.sum(np.delete(p * apart**2, k)))
     axis_deg = float(np.hypot(np.sqrt(2) * parallel_deg(sight), others))
@@ -300,7 +299,3 @@ def _turned(b: Bundle, along: np.ndarray) -> Sequence[Bundle]:
         return []
     k = float(np.linalg.norm(t.curvature))
     return [replace(b, X=X, twist=Twist(t.anchor, d / size, sign * k * along)) for sign in (1.0, -1.0)]
-
-
-def _apart_deg(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip(abs(one @ other), 0, 1))))
