@@ -29,6 +29,7 @@ from reconstruct.joint.models import JointFit
 from reconstruct.joint.parallels import along_edges
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
+from reconstruct.joint.plates import as_plate
 from reconstruct.joint.result import MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
@@ -215,13 +216,16 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         return None
     if before is not None and not _more(done.members, before.members, times):
         return None
-    done, note = _by_pixels(done, pictures, "; the motion is slight")
+    done, note = _better_held(done, pictures, "; the motion is slight")
     fit = result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
     return fit if together else replace(fit, verdict="ambiguous", reason=f"{fit.reason}; {STRAYS}")
 
 
-def _by_pixels(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
-    """The joint before a resting camera, along edges and by its faces where these hold it better, and the words."""
+def _better_held(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
+    """The joint before a resting camera, as that of a plate or, where there are pictures, along edges and by its faces,
+    where these hold it better; and the words."""
+    if (plate := as_plate(done)) is not done:
+        return plate, f"{note}; the link is taken as a plate that turns in its plane"
     if pictures is None:
         return done, note
     if (parallel := along_edges(done, pictures)) is not done:
@@ -279,7 +283,7 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
     if reason := why_not_believed(done, restless):
         return refused(reason, done.members, done.bundle.sigma)
     if video.warp is None:
-        done, note = _by_pixels(done, pictures, note)
+        done, note = _better_held(done, pictures, note)
     full = camera.focal / video.scale
     fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
     return _Draw(fit, found.explained, done.bundle.sigma, done)

@@ -55,6 +55,8 @@ class Sightings:
         free: True if the camera's poses are unknown, R and t but a start; the world is the first camera then.
         slip: (N, T, 2) along what the picture holds badly, see paths.py; None if there is none.
         along: (3,) unit, world: what the axis is taken to be parallel to; None where nothing is known of it.
+        flat: standard deviation, over the link's size, of its points' distances from one plane at right angles to the
+            axis; None where nothing is known of them.
     """
 
     uv: np.ndarray
@@ -71,6 +73,7 @@ class Sightings:
     free: bool = False
     slip: np.ndarray | None = None
     along: np.ndarray | None = None
+    flat: float | None = None
 
     def of(self, tracks: np.ndarray) -> Sightings:
         """Of some of the tracks of a link."""
@@ -223,6 +226,61 @@ class Reach:
 
 
 @dataclass(frozen=True)
+class Flat:
+    """How far the points of a link leave its plane, which it turns in: what does costs its squared distance from it.
+
+    A point in a plane at right angles to the axis has no depth of its own, and how the plane lies is seen in how the
+    circles in it are foreshortened.
+
+    Attributes:
+        height: of the plane along the axis, from the twist's anchor. It is no unknown: nothing holds the scale.
+        weight: (N,) px^2 over a squared length; empty where the link may have any shape.
+    """
+
+    height: float
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, b: Bundle, s: Sightings, sigma: float) -> Flat:
+        if s.flat is None:
+            return cls(0.0, np.zeros(0))
+        size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
+        weight = s.weight * s.lasting * (sigma / max(s.flat * size, 1e-9)) ** 2
+        return cls(float(np.median((b.X - b.twist.anchor) @ b.twist.axis)), weight)
+
+    def off(self, b: Bundle) -> np.ndarray:
+        """(N,) distances of the points from the plane."""
+        return (b.X - b.twist.anchor) @ b.twist.axis - self.height
+
+    def cost(self, b: Bundle) -> float:
+        """px^2."""
+        return float(self.weight @ self.off(b) ** 2) if len(self.weight) else 0.0
+
+    def slopes(self, b: Bundle) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3, 3) and (N, 3) of half the cost by the points."""
+        a = b.twist.axis
+        if not len(self.weight):
+            return np.zeros((len(b.X), 3, 3)), np.zeros((len(b.X), 3))
+        return self.weight[:, None, None] * np.outer(a, a), (self.weight * self.off(b))[:, None] * a
+
+    def add(self, n: Normal, b: Bundle) -> None:
+        """Into the normal equations."""
+        if not len(self.weight):
+            return
+        G = n.Z.shape[1]
+        by_step = (b.X - b.twist.anchor) @ b.twist.axis_by_step(n.Z)  # (N, G)
+        H, g = self.slopes(b)
+        weighted = self.weight[:, None] * by_step
+        scores = weighted * self.off(b)[:, None]
+        n.Hp[...] += H
+        n.gp[...] += g
+        n.H[:G, :G] += by_step.T @ weighted
+        n.g[:G] += scores.sum(0)
+        n.scores[:, :G] += scores
+        n.C[:G] += weighted.T[:, :, None] * b.twist.axis
+
+
+@dataclass(frozen=True)
 class _Priors:
     """What is known besides the pictures, as squares in px^2.
 
@@ -234,6 +292,7 @@ class _Priors:
         ends: the frames with the least and the most path of those that tracks hold. Measured from the first frame,
             which may show nothing of the link, a hinge would get its radius by a path that nothing contradicts.
         reach: of the link's points.
+        flat: of the same.
         along, parallel: what the axis is parallel to, and the weight of the sine of the angle between them.
     """
 
@@ -243,6 +302,7 @@ class _Priors:
     log_turn: float
     ends: tuple[int, int]
     reach: Reach
+    flat: Flat
     along: np.ndarray | None = None
     parallel: float = 0.0
 
@@ -267,17 +327,21 @@ class _Priors:
         ends = int(held[np.argmin(b.q[held])]), int(held[np.argmax(b.q[held])])
         path = float(b.q[ends[1]] - b.q[ends[0]])
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
-        reach = Reach.of(b, s, sigma)
+        reach, flat = Reach.of(b, s, sigma), Flat.of(b, s, sigma)
         if b.kind == "prismatic" or s.link is not None or path <= 0 or size <= 0:
-            return cls(focal, bend, 0.0, 0.0, ends, reach, s.along, parallel)
+            return cls(focal, bend, 0.0, 0.0, ends, reach, flat, s.along, parallel)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
         log_turn = float(np.log(path / (HINGE_RADIUS * size)))
-        return cls(focal, bend, radius, log_turn, ends, reach, s.along, parallel)
+        return cls(focal, bend, radius, log_turn, ends, reach, flat, s.along, parallel)
 
     def cost(self, b: Bundle) -> float:
         """Without the radius, which is weighed apart where types are compared."""
         aside = 0.0 if self.along is None else float(np.sum(np.cross(self.along, b.twist.axis) ** 2))
         return self.focal * b.log_focal**2 + float(b.q @ self.bend @ b.q) + self.parallel * aside
+
+    def of_points(self, b: Bundle) -> float:
+        """Of where the points lie."""
+        return self.reach.cost(b.X) + self.flat.cost(b)
 
     def radius_cost(self, b: Bundle) -> float:
         """Of the radius alone."""
@@ -305,6 +369,7 @@ class _Priors:
         H, g = self.reach.slopes(b.X)
         n.Hp[...] += H
         n.gp[...] += g
+        self.flat.add(n, b)
         k2 = float(b.twist.curvature @ b.twist.curvature)
         if self.radius and k2 > 0:
             row = np.zeros(len(n.g))
@@ -373,7 +438,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
         loss, w = robust_loss(r, s, limit)
         for _ in range(iterations):
             priors = _Priors.of(b, s, sigma, hold, w)
-            cost = loss + priors.cost(b) + priors.radius_cost(b) + priors.reach.cost(b.X)
+            cost = loss + priors.cost(b) + priors.radius_cost(b) + priors.of_points(b)
             n = normal_equations(b, s, world, cam, r, w)
             priors.add(n, b)
             better = False
@@ -392,7 +457,7 @@ def polish(b: Bundle, s: Sightings, iterations: int = 15, scale: float | None = 
                 world_t, cam_t = positions(trial, s)
                 r_t = residuals(trial, s, cam_t)
                 loss_t, w_t = robust_loss(r_t, s, limit)
-                cost_t = loss_t + priors.cost(trial) + priors.radius_cost(trial) + priors.reach.cost(trial.X)
+                cost_t = loss_t + priors.cost(trial) + priors.radius_cost(trial) + priors.of_points(trial)
                 if cost_t < cost:
                     better = cost - cost_t > 1e-7 * cost
                     b, world, cam, r, w, loss = trial, world_t, cam_t, r_t, w_t, loss_t
@@ -486,8 +551,8 @@ def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
         H = np.einsum("nt,ntij,ntik->njk", w, J, J, optimize=True)
         g = np.einsum("nt,ntij,nti->nj", w, J, r, optimize=True)
         H += (1e-4 * np.trace(H, axis1=1, axis2=2) / 3 + 1e-12)[:, None, None] * np.eye(3)
-        by_reach = Reach.of(b, s, b.sigma).slopes(b.X)
-        H, g = H + by_reach[0], g + by_reach[1]
+        for more in (Reach.of(b, s, b.sigma).slopes(b.X), Flat.of(b, s, b.sigma).slopes(b)):
+            H, g = H + more[0], g + more[1]
         step = -np.linalg.solve(H, g[..., None])[..., 0]
         limit_step = 0.4 * np.linalg.norm(b.X, axis=1)
         step *= np.minimum(1, limit_step / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]

@@ -60,10 +60,11 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     contradicts it beside a doubtful one. In a grey world only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
-    itself, else ambiguous. What is found without them is ambiguous where nearly all of it may be on a shadow too, and
-    refused where it is doubtful besides. Nothing is refused where one of the same type is found without all that may be
-    on a shadow, however doubtful: a part beside its own shadow. Of doubtful ones the one counts that its tracks follow
-    most exactly.
+    itself, else ambiguous; of these two the second, and a sure one in its place, where one of the same type is found
+    without all that may be on a shadow and its tracks follow it more exactly. What is found without the edges is
+    ambiguous where nearly all of it may be on a shadow too, and refused where it is doubtful besides. Nothing is
+    refused where one of the same type is found without all that may be on a shadow, however doubtful: a part beside its
+    own shadow. Of doubtful ones the one counts that its tracks follow most exactly.
 
     Args:
         fit: the joint of all these tracks, or a refusal.
@@ -123,8 +124,12 @@ def _nothing_without(fit: JointFit, cast: np.ndarray, ask_lit: Callable[[], Join
     """
     words = f"{int(cast.sum())} of the {len(cast)} tracks that agree lie on the edge of one"
     nearly_all = np.mean(cast) >= SHADOWS
-    if (nearly_all or fit.verdict != "ok") and ask_lit().type != fit.type:
-        return _refuse(fit, words if nearly_all else f"{words}, and {_first(fit.reason)}")
+    if nearly_all or fit.verdict != "ok":
+        lit = ask_lit()
+        if lit.type != fit.type:
+            return _refuse(fit, words if nearly_all else f"{words}, and {_first(fit.reason)}")
+        if _sharper(lit, fit):
+            return replace(lit, verdict="ambiguous", reason=f"without what may be on a shadow, {lit.reason}")
     return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
 
 

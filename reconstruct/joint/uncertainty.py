@@ -14,6 +14,7 @@ import numpy as np
 from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
     Bundle,
+    Flat,
     Sightings,
     frames_held,
     normal_equations,
@@ -158,6 +159,7 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     link = np.ones(len(b.X), bool) if s.link is None else s.link
     G = n.Z.shape[1]
     tw = b.twist
+    Flat.of(b, s, b.sigma).add(n, b)
     S, _, inv = n.reduced(0.0)
     if s.focal_std > 0:
         S[G, G] += b.sigma**2 * s.lasting / s.focal_std**2
