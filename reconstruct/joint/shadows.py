@@ -174,13 +174,13 @@ def _doubtful(joint: JointFit) -> bool:
 
 
 def _most_exact(fit: JointFit, again: JointFit, lit: JointFit) -> JointFit:
-    """Of joints found with shadows' edges, without these, and without all that may be on a shadow, the one of more than
-    a few tracks that these miss least; doubtful, however sure it is by itself."""
+    """Of joints found with shadows' edges, without these, and without all that may be on a shadow, one of which is no
+    refusal, the one of more than a few tracks that these miss least; doubtful, however sure it is by itself."""
     found = [(again, "without what is on a shadow's edge"), (lit, "without what may be on a shadow"),
              (fit, "part of what moves may be a shadow")]  # fmt: skip
-    few = FEW * max(fit.inliers, again.inliers)
-    best, words = min((x for x in found if x[0].inliers >= few and x[0].residual_px is not None),
-                      key=lambda x: float(x[0].residual_px or 0.0))  # fmt: skip
+    found = [x for x in found if x[0].residual_px is not None]
+    few = FEW * max(x[0].inliers for x in found)
+    best, words = min((x for x in found if x[0].inliers >= few), key=lambda x: float(x[0].residual_px or 0.0))
     return replace(best, verdict="ambiguous", reason=f"{words}, {best.reason}")
 
 
