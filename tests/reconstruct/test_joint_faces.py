@@ -217,6 +217,24 @@ def test_faces_mend_tracks_that_err_alike():
     assert len(place) == 4 and np.allclose(place, SIDE / 2, rtol=0.15)
 
 
+@pytest.mark.slow
+def test_faces_do_not_know_the_states_that_no_track_shows():
+    plate = film(0, fine=5.0)
+    done = by_tracks(plate, 0)
+    seen = done.sight.seen.copy()
+    seen[:, :4] = False
+    b = done.bundle
+    bent = replace(b, q=np.where(np.arange(T) < 4, b.q[4], b.q) - b.q[4])
+    sight = replace(done.sight, seen=seen)
+    vague = replace(done.spread, q=np.full(T, 0.5))
+    hidden = replace(done, bundle=bent, sight=sight, spread=vague)
+    mended = by_faces(hidden, plate.pictures)
+    assert mended is not hidden
+    # They are relative to the first frame, which is not shown.
+    assert np.all(mended.spread.q >= 0.5)
+    assert by_faces(done, plate.pictures).spread.q.max() < 0.1
+
+
 def test_pictures_that_show_nothing_change_nothing():
     plate = film(0)
     done = by_tracks(plate, 0)

@@ -304,6 +304,39 @@ def test_two_sure_joints_with_and_without_shadows_that_contradict_each_other_are
     assert (fit.verdict, fit.residual_px) == (verdict, px)
 
 
+@pytest.mark.parametrize(("verdict", "px", "expected"), [
+    ("ok", 0.05, ("ambiguous", 0.05)),  # sure and more exact: its axis counts
+    ("ok", 0.2, ("ambiguous", 0.1)),
+    ("ambiguous", 0.05, ("ambiguous", 0.1)),
+])  # fmt: skip
+def test_of_a_joint_that_is_none_without_shadows_a_sure_one_off_all_that_may_be_one_counts(verdict, px, expected):
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    number = np.arange(len(scene.tracks.uv))
+    tracks = replace(scene.tracks, cast=number < 60, shade=number < 90)
+
+    def ask(some):
+        left_out = int((~some.visible.any(1)).sum())
+        return JointFit("refused", "a free body") if left_out == 60 else made(verdict, 30.0, px, number[90:140])
+
+    fit = unless_a_shadow(made("ambiguous", 0.0, 0.1, number[:110]), scene.video, tracks, ask)
+    assert (fit.verdict, fit.residual_px) == expected
+
+
+def test_few_is_by_the_joints_that_were_found():
+    """A refusal that four hundred tracks agree with leaves two joints of ninety: one of these counts."""
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    number = np.arange(len(scene.tracks.uv))
+    tracks = replace(scene.tracks, cast=number < 100, shade=number < 130)
+
+    def ask(some):
+        left_out = int((~some.visible.any(1)).sum())
+        px = 0.1 if left_out == 100 else 0.05
+        return made("ambiguous", 0.0, px, number[100:190], 40.0)
+
+    fit = unless_a_shadow(JointFit("refused", "a free body", inliers=442), scene.video, tracks, ask)
+    assert (fit.verdict, fit.residual_px) == ("ambiguous", 0.05)
+
+
 def test_what_is_beside_a_shadows_edge_may_be_on_it():
     scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
     T = len(scene.video)
