@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from reconstruct.cues import Tracks
 from reconstruct.joint.answers import alone_deg, contradicts
 from reconstruct.joint.fit import moving_tracks
+from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -110,7 +111,10 @@ def _mostly_shadows(fit: JointFit, again: JointFit, lit: JointFit, share: float)
     """What becomes of a joint that is found without the edges of shadows, so much of which may be on them too."""
     words = f"without the edges of one, {share:.0%} of the tracks that agree may be on it too"
     if again.verdict == "ok":
-        return replace(again, verdict="ambiguous", reason=f"what moves may be a shadow: {words}; {again.reason}")
+        # Its type is the part's, or says nothing of it.
+        p = or_by_prior(again.type_probability)
+        reason = f"what moves may be a shadow: {words}; {again.reason}"
+        return replace(again, verdict="ambiguous", reason=reason, type_probability=p)
     if lit.type == again.type == fit.type:
         return _most_exact(fit, again, lit)
     return _refuse(again, f"{words}, and {_first(again.reason)}")
@@ -130,7 +134,8 @@ def _nothing_without(fit: JointFit, cast: np.ndarray, ask_lit: Callable[[], Join
             return _refuse(fit, words if nearly_all else f"{words}, and {_first(fit.reason)}")
         if _sharper(lit, fit):
             return replace(lit, verdict="ambiguous", reason=f"without what may be on a shadow, {lit.reason}")
-    return replace(fit, verdict="ambiguous", reason=f"part of what moves is a shadow: {words}; {fit.reason}")
+    p, reason = or_by_prior(fit.type_probability), f"part of what moves is a shadow: {words}; {fit.reason}"
+    return replace(fit, verdict="ambiguous", reason=reason, type_probability=p)
 
 
 def maybe_shadows(video: Video, tracks: Tracks) -> np.ndarray:
