@@ -37,8 +37,9 @@ MISSED_PX = 3.0
 """Beyond which it counts no more by how much a track misses its place."""
 AWAY, AWAY_PX = 1.15, 0.005
 """How many times worse, and by how many px, tracks may keep to a plate than to a link of any shape."""
-STRAY, KEPT = 2.5, 0.6
-"""Standard deviations of the noise beyond which a track strays from a plate, and the share of them that must not."""
+STRAY, KEPT = 2.5, 0.7
+"""Standard deviations of the noise beyond which a track strays from a plate, and the share that has to be left if such
+are left out."""
 PLATE = 0.85
 """Probability that a link is one whose tracks keep to one as well as that."""
 SAME_DEG = 2.0
@@ -103,7 +104,7 @@ class _Plate:
 
 
 def _plate(start: Bundle, free: Bundle, sight: Sightings) -> _Plate | None:
-    """The best plate from a start, or None if too many tracks stray from it or the others miss it by too much.
+    """The best plate from a start, or None if its tracks miss it by too much.
 
     Args:
         free: the link of any shape.  sight: observations of all tracks of both.
@@ -114,7 +115,7 @@ def _plate(start: Bundle, free: Bundle, sight: Sightings) -> _Plate | None:
     missed = np.sum(residuals(whole, bound) ** 2, axis=(1, 2)) / np.maximum(2 * sight.seen.sum(1), 1)
     kept = np.sqrt(missed) < STRAY * max(whole.sigma, 0.05)
     if kept.mean() < KEPT:
-        return None
+        kept[:] = True
     bound = bound.of(kept)
     b = polish(replace(whole, X=whole.X[kept]), bound)
     rest = replace(bound, flat=None)
