@@ -292,7 +292,8 @@ def test_of_a_joint_that_was_mostly_a_shadow_some_more_that_may_be_one_makes_it_
 ])  # fmt: skip
 def test_two_sure_joints_with_and_without_shadows_that_contradict_each_other_are_doubtful(by_itself, turn, verdict, px):
     """An oven's door was a sure hinge 32 deg off by the 35 tracks that were left, and 2 deg off by all."""
-    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8)
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8,
+                       points=150)  # fmt: skip
     number = np.arange(len(scene.tracks.uv))
     tracks = replace(scene.tracks, cast=number < 45, shade=number < 90)
 
