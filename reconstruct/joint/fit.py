@@ -111,8 +111,9 @@ def fit_joint(
             is found together with the joint, from the static scene's tracks; the world is then up to the first camera.
             Where it is not said and all tracks move as one body, the answer is "ambiguous", its type no surer than one
             half and half of the prior: it may be the camera that moves.
-        pictures: of the video's frames, working px. Where the camera rests, a hinge that the link's whole faces hold
-            better than the tracks do is taken from them.
+        pictures: of the video's frames, working px. Where the camera rests, a hinge that straight edges around the
+            link or its whole faces hold better than the tracks do is taken along or from these; one whose link's
+            tracks keep to a plate that turns in its plane is taken so without them.
 
     Returns:
         A JointFit up to scale (median depth of the link = 1), or one with verdict "refused".

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.normal import Normal, normal_equations
 from reconstruct.joint.paths import held
+from reconstruct.joint.shape import Flat, Reach
 from reconstruct.joint.twist import Twist
 
 BEND = 0.1
@@ -29,8 +30,6 @@ HINGE_RADIUS, HINGE_SPREAD = 0.45, 0.5
 """Median distance of a hinge from the link's middle over the link's size, and the standard deviation of its logarithm.
 The hinges of simulated furniture lie 0.34 to 0.64 link diagonals away (knobs less); texture on a part of the link only
 makes it look smaller."""
-REACH = 1.5
-"""Link sizes from the middle up to which a point may lie anywhere."""
 HOLDERS = 3
 """Tracks that a frame must show near where the joint has them for its state to be part of the stroke."""
 PARALLEL_DEG = 0.7
@@ -185,99 +184,6 @@ def track_costs(r: np.ndarray, s: Sightings, scale: float) -> np.ndarray:
     by = np.ones(len(r)) if s.relative is None else 1 / s.relative**2
     g = scale**2 / (scale**2 + by[:, None] * np.sum(r**2, axis=-1))
     return s.weight * np.sum(s.seen * scale**2 * (1 - g), axis=1)
-
-
-@dataclass(frozen=True)
-class Reach:
-    """How far a link's points may lie from its middle: what is farther costs the squared distance from that sphere.
-
-    A point on an edge that goes along its own image has no depth but this, and a joint of the wrong type takes up what
-    contradicts it in points far before or behind the link.
-
-    Attributes:
-        middle: (3,).  radius: of the sphere.  weight: px^2 over a squared length; 0 beside a resting scene.
-    """
-
-    middle: np.ndarray
-    radius: float
-    weight: float
-
-    @classmethod
-    def of(cls, b: Bundle, s: Sightings, sigma: float) -> Reach:
-        """The link's size is read across the line of sight, and is one standard deviation beyond the sphere."""
-        middle = np.median(b.X, axis=0)
-        across = b.X[:, :2] / np.maximum(b.X[:, 2:], 1e-3) * middle[2]
-        size = float(np.linalg.norm(np.quantile(across, 0.95, axis=0) - np.quantile(across, 0.05, axis=0)))
-        weight = 0.0 if s.link is not None or size <= 0 else s.lasting * (sigma / size) ** 2
-        return cls(middle, REACH * size, weight)
-
-    def cost(self, X: np.ndarray) -> float:
-        """Of points (N, 3), px^2."""
-        return self.weight * float(np.sum(np.maximum(np.linalg.norm(X - self.middle, axis=1) - self.radius, 0) ** 2))
-
-    def slopes(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3, 3) and (N, 3) of half the cost by the points."""
-        d = X - self.middle
-        far = np.linalg.norm(d, axis=1)
-        out = d / np.maximum(far, 1e-12)[:, None]
-        beyond = np.maximum(far - self.radius, 0)
-        H = self.weight * (beyond > 0)[:, None, None] * out[:, :, None] * out[:, None]
-        return H, self.weight * beyond[:, None] * out
-
-
-@dataclass(frozen=True)
-class Flat:
-    """How far the points of a link leave its plane, which it turns in: what does costs its squared distance from it.
-
-    A point in a plane at right angles to the axis has no depth of its own, and how the plane lies is seen in how the
-    circles in it are foreshortened.
-
-    Attributes:
-        height: of the plane along the axis, from the twist's anchor. It is no unknown: nothing holds the scale.
-        weight: (N,) px^2 over a squared length; empty where the link may have any shape.
-    """
-
-    height: float
-    weight: np.ndarray
-
-    @classmethod
-    def of(cls, b: Bundle, s: Sightings, sigma: float) -> Flat:
-        if s.flat is None:
-            return cls(0.0, np.zeros(0))
-        size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
-        weight = s.weight * s.lasting * (sigma / max(s.flat * size, 1e-9)) ** 2
-        return cls(float(np.median((b.X - b.twist.anchor) @ b.twist.axis)), weight)
-
-    def off(self, b: Bundle) -> np.ndarray:
-        """(N,) distances of the points from the plane."""
-        return (b.X - b.twist.anchor) @ b.twist.axis - self.height
-
-    def cost(self, b: Bundle) -> float:
-        """px^2."""
-        return float(self.weight @ self.off(b) ** 2) if len(self.weight) else 0.0
-
-    def slopes(self, b: Bundle) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3, 3) and (N, 3) of half the cost by the points."""
-        a = b.twist.axis
-        if not len(self.weight):
-            return np.zeros((len(b.X), 3, 3)), np.zeros((len(b.X), 3))
-        return self.weight[:, None, None] * np.outer(a, a), (self.weight * self.off(b))[:, None] * a
-
-    def add(self, n: Normal, b: Bundle) -> None:
-        """Into the normal equations."""
-        if not len(self.weight):
-            return
-        G = n.Z.shape[1]
-        by_step = (b.X - b.twist.anchor) @ b.twist.axis_by_step(n.Z)  # (N, G)
-        H, g = self.slopes(b)
-        weighted = self.weight[:, None] * by_step
-        scores = weighted * self.off(b)[:, None]
-        n.Hp[...] += H
-        n.gp[...] += g
-        n.H[:G, :G] += by_step.T @ weighted
-        n.g[:G] += scores.sum(0)
-        n.scores[:, :G] += scores
-        n.C[:G] += weighted.T[:, :, None] * b.twist.axis
 
 
 @dataclass(frozen=True)

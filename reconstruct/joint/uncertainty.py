@@ -14,7 +14,6 @@ import numpy as np
 from reconstruct.joint.polish import (
     ROBUST_SIGMAS,
     Bundle,
-    Flat,
     Sightings,
     frames_held,
     normal_equations,
@@ -23,6 +22,7 @@ from reconstruct.joint.polish import (
     residuals,
     robust_loss,
 )
+from reconstruct.joint.shape import Flat
 
 CELL = 0.06
 """Edge of a cluster over the link's diagonal."""

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from reconstruct.joint.finish import Finished, View, turn_deg
 from reconstruct.joint.normal import normal_equations
 from reconstruct.joint.plates import FLAT, WORTH_DEG, as_plate
-from reconstruct.joint.polish import Bundle, Flat, Sightings, polish, positions, residuals, robust_loss
+from reconstruct.joint.polish import Bundle, Sightings, polish, positions, residuals, robust_loss
+from reconstruct.joint.shape import Flat
 from reconstruct.joint.twist import twist_of_joint
 from reconstruct.joint.uncertainty import spread
 
