@@ -52,7 +52,7 @@ def as_plate(done: Finished) -> Finished:
     """A hinge with its link in one plane at right angles to it, where its tracks keep to that; else ``done``.
 
     Args:
-        done: before a resting camera.
+        done: before a resting camera; of N tracks, some of which the answer may leave out.
     """
     b, sight, free = done.bundle, done.sight, done.axis_deg
     if sight.R is not None or b.kind != "revolute" or free < WORTH_DEG:

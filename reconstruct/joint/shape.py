@@ -74,6 +74,7 @@ class Flat:
 
     @classmethod
     def of(cls, b: Bundle, s: Sightings, sigma: float) -> Flat:
+        """The plane through the middle of the points of N tracks; sigma: their noise, px."""
         if s.flat is None:
             return cls(0.0, np.zeros(0))
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
@@ -85,7 +86,7 @@ class Flat:
         return (b.X - b.twist.anchor) @ b.twist.axis - self.height
 
     def cost(self, b: Bundle) -> float:
-        """px^2."""
+        """Of all points, px^2; 0 where the link may have any shape."""
         return float(self.weight @ self.off(b) ** 2) if len(self.weight) else 0.0
 
     def slopes(self, b: Bundle) -> tuple[np.ndarray, np.ndarray]:
