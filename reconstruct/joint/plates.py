@@ -24,6 +24,9 @@ from reconstruct.joint.uncertainty import spread
 
 WORTH_DEG = 1.5
 """Standard deviation of an axis below which the tracks are believed as they are."""
+FEWEST = 20
+"""Tracks: a plane can be laid through fewer by nearly any link (13 of a stapler's made a sure plate, 68 deg off; rendered
+scissors that were found so have 26 and more)."""
 FLAT = 0.03
 """Standard deviation, over the link's size, by which points of a plate leave its plane: it has a thickness."""
 PLANES, STEEP = 500, 0.2
@@ -55,7 +58,7 @@ def as_plate(done: Finished) -> Finished:
         done: before a resting camera; of N tracks, some of which the answer may leave out.
     """
     b, sight, free = done.bundle, done.sight, done.axis_deg
-    if sight.R is not None or b.kind != "revolute" or free < WORTH_DEG:
+    if sight.R is not None or b.kind != "revolute" or free < WORTH_DEG or len(done.members) < FEWEST:
         return done
     found: list[_Plate] = []
     for start in _starts(b, sight):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.finish import Finished, View, turn_deg
 from reconstruct.joint.normal import normal_equations
-from reconstruct.joint.plates import FLAT, WORTH_DEG, as_plate
+from reconstruct.joint.plates import FEWEST, FLAT, WORTH_DEG, as_plate
 from reconstruct.joint.polish import Bundle, Sightings, polish, positions, residuals, robust_loss
 from reconstruct.joint.shape import Flat
 from reconstruct.joint.twist import twist_of_joint
@@ -50,6 +50,16 @@ def joint(X: np.ndarray, turn_deg: float, noise: float, seed: int, strays: int =
 
 def off_deg(found: Finished) -> float:
     return float(np.degrees(np.arccos(min(1.0, abs(found.bundle.twist.axis @ AXIS)))))
+
+
+def test_a_plane_through_a_few_points_is_no_evidence():
+    free = joint(blade(np.random.default_rng(0)), 10.0, 0.5, 0)
+    few = np.arange(FEWEST - 1)
+    sight = free.sight.of(few)
+    b = polish(replace(free.bundle, X=free.bundle.X[few]), sight, iterations=40)
+    some = replace(free, bundle=b, sight=sight, members=few, spread=spread(b, sight))
+    assert some.axis_deg > WORTH_DEG
+    assert as_plate(some) is some
 
 
 @pytest.mark.parametrize("seed", range(4))
