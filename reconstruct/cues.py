@@ -89,6 +89,11 @@ class Tracks:
     shade: np.ndarray | None = None
     cast: np.ndarray | None = None
 
+    def of(self, rows: np.ndarray) -> Tracks:
+        """Some of them."""
+        some = [None if x is None else x[rows] for x in (self.slip, self.shade, self.cast)]
+        return Tracks(self.uv[rows], self.visible[rows], self.reference[rows], self.provider, *some)
+
 
 @dataclass(frozen=True)
 class LinkMasks:

@@ -322,11 +322,14 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     they were many, the wedge of an arm may have held the part: then all tracks are asked, and a joint that is not
     mostly an arm's counts. Shadows go nearly as the part goes too. What may be the edge of one is left out where enough
     else moves, and asked where nothing is found without it. What one straight edge alone follows is no sure joint.
+    Where nothing is found at all, the part's straight edges are followed and asked too.
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.edges import unless_one_edge
     from reconstruct.joint.fit import fit_joint, moving_tracks
+    from reconstruct.joint.rims import unless_rims_tell
     from reconstruct.joint.shadows import off_shadows, unless_a_shadow
+    from reconstruct.providers.edge_tracks import edge_tracks
     from reconstruct.providers.lk_tracks import pictures_of
 
     pictures = pictures_of(video, hands)
@@ -338,6 +341,10 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     def ask(some: Tracks) -> JointFit:
         return fit_joint(video, some, focal, seed, progress, camera_moving=False, pictures=pictures)
 
+    def rims() -> Tracks:
+        edges = edge_tracks(video, pictures)
+        return edges.of(~on_forearm(edges, hands))
+
     def off_shadows_too(some: Tracks) -> JointFit:
         return unless_a_shadow(ask(some), video, some, ask)
 
@@ -347,7 +354,9 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     fit = unless_one_edge(unless_a_shadow(fit, video, asked, ask), video, asked, off_shadows_too)
     if fit.verdict == "refused" and share >= ARM_SHARE:
         again = unless_one_edge(off_shadows_too(tracks), video, tracks, off_shadows_too)
-        return fit if again.verdict == "refused" or np.mean(arm[again.point_track]) >= 0.5 else again
+        if again.verdict != "refused" and np.mean(arm[again.point_track]) < 0.5:
+            return again
+    fit = unless_rims_tell(fit, video, rest, rims, ask)
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
 
@@ -384,7 +393,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         return fit_from_cues(tracks, camera, depth, tracks_cue.get("xyz_world"), moving, video.size, metric, seed)
 
     with_depth = {key: given.get(key) for key in ("depth", "camera", "masks")} if ranged else None
-    parts = ("joint", "depth.py", "hand/forearm.py")
+    parts = ("joint", "depth.py", "hand/forearm.py", "providers/edge_tracks.py", "providers/shade.py")
     fit: JointFit = stages.run("joint", find, parts, options={"focal": focal, "with_depth": with_depth})
     if ranged and fit.verdict == "refused":
         notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")

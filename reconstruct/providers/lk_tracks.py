@@ -191,7 +191,7 @@ def track_points(
     uv, reference = pieces(uv, reference, lost)
     return Tracks(video.to_full(uv).astype(np.float32), np.isfinite(uv[..., 0]), reference,
                   ProviderInfo("lk", cv2.__version__, "Apache-2.0"), slip_of(grey, uv),
-                  *_shadows(video, uv, covered))  # fmt: skip
+                  *shadows(video, uv, covered))  # fmt: skip
 
 
 def pieces(uv: np.ndarray, reference: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -226,8 +226,12 @@ def pieces(uv: np.ndarray, reference: np.ndarray, lost: np.ndarray) -> tuple[np.
     return np.concatenate(out), np.concatenate(start)
 
 
-def _shadows(video: Video, uv: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool each, ``shade`` and ``cast`` as in :class:`Tracks`; the second is asked of what moves only."""
+def shadows(video: Video, uv: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool each, ``shade`` and ``cast`` as in :class:`Tracks`; the second is asked of what moves only.
+
+    Args:
+        uv: (N, T, 2) working px, NaN where not seen.  covered: (T, h, w) bool, under a hand.
+    """
     shade = one_colour(video.frames, uv)
     cast = np.zeros(len(uv), bool)
     extent = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)

@@ -1,0 +1,73 @@
+"""A part whose points show no joint, asked again with its straight edges.
+
+Parts of even paint, and small ones, have few points, which are lost within a few frames, and shadows have many: what is
+left when those are taken away follows nothing, and the joint is refused. The straight edges that move and are no
+shadow's are nearly all the part's, and are seen throughout. They say little by themselves, as each is held across
+itself only, but with the few points enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruct.cues import Tracks
+from reconstruct.joint.kinds import or_by_prior
+from reconstruct.joint.models import JointFit
+from reconstruct.joint.result import MIN_INLIERS
+from reconstruct.joint.shadows import maybe_shadows, without
+from reconstruct.video import Video
+
+FACTOR = 2.0
+"""How many times what is stated such joints are off (the root of the mean square of ten rendered ones, 0.1 to 3.6)."""
+WORDS = "its points alone show no joint, with its straight edges"
+
+
+def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable[[], Tracks],
+                     ask: Callable[[Tracks], JointFit]) -> JointFit:  # fmt: skip
+    """The joint, or where it is refused what points and straight edges together follow, doubtful in any case.
+
+    They are asked without all that may be a shadow, and a sure answer counts; else without the edges of shadows, and
+    what is found counts; else what was found first.
+
+    Args:
+        fit: the joint of the points, or a refusal.
+        rims: for the moving straight edges that are no shadow's and on no arm, as tracks of the same video.
+        ask: for the joint of some tracks.
+    """
+    if fit.verdict != "refused" or video.warp is not None or tracks.cast is None:
+        return fit
+    edges = rims()
+    if not len(edges.uv):
+        return fit
+    lit = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), len(tracks.uv))
+    if lit is not None and lit.verdict == "ok":
+        return _doubtful(lit)
+    found = _answer(ask(_joined(without(tracks, tracks.cast), edges)), len(tracks.uv)) or lit
+    return fit if found is None else _doubtful(found)
+
+
+def _joined(points: Tracks, edges: Tracks) -> Tracks:
+    """Tracks of points and of edges, in this order."""
+    known = [k for k in ("uv", "visible", "reference", "slip", "shade", "cast") if getattr(points, k) is not None]
+    return replace(points, **{k: np.concatenate([getattr(points, k), getattr(edges, k)]) for k in known})
+
+
+def _answer(fit: JointFit, points: int) -> JointFit | None:
+    """A joint as one of so many points, without what it knows of edges; None if none was found, or it has no points."""
+    if fit.verdict == "refused" or fit.points is None or fit.point_track is None:
+        return None
+    own = fit.point_track < points
+    if own.sum() < MIN_INLIERS:
+        return None
+    return replace(fit, points=fit.points[own], point_track=fit.point_track[own], tracks=points)
+
+
+def _doubtful(fit: JointFit) -> JointFit:
+    p, std = or_by_prior(fit.type_probability), dict(fit.std)
+    for k in ("axis_deg", "point_m"):
+        if k in std:
+            std[k] = FACTOR * std[k]
+    return replace(fit, verdict="ambiguous", reason=f"{WORDS}, {fit.reason}", type_probability=p, std=std)

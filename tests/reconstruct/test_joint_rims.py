@@ -1,0 +1,108 @@
+"""When straight edges are asked besides points, and what becomes of what they show."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint.models import JointFit
+from reconstruct.joint.rims import FACTOR, unless_rims_tell
+from reconstruct.video import Video
+
+T, POINTS, EDGES = 12, 30, 10
+VIDEO = Video(Path("none.mp4"), "0" * 64, (640, 480), np.arange(T) / 30, np.arange(T), T,
+              np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, 480, 640, 3)), 1.0)  # fmt: skip
+REFUSED = JointFit("refused", "too few tracks agree")
+
+
+def tracks(count: int, x: float, cast: int = 0) -> Tracks:
+    """So many, 15 px from each other, the first of them on the edges of shadows."""
+    uv = np.zeros((count, T, 2), np.float32)
+    uv[..., 0] = x + 15.0 * np.arange(count)[:, None]
+    uv[..., 1] = 100 + 2.0 * np.arange(T)
+    on = np.arange(count) < cast
+    return Tracks(uv, np.ones((count, T), bool), np.zeros(count, int), ProviderInfo("t", "1", "Apache-2.0"),
+                  np.zeros((count, T, 2), np.float32), on.copy(), on)  # fmt: skip
+
+
+def joint(verdict: str, ids: np.ndarray) -> JointFit:
+    """A hinge that these tracks follow."""
+    p, std = {"revolute": 0.99, "prismatic": 0.01}, {"axis_deg": 4.0, "point_m": 0.01}
+    return JointFit(verdict, "tracks agree", "revolute", p, axis=np.array([0, 0, 1.0]), points=np.zeros((len(ids), 3)),
+                    point_track=ids, std=std, inliers=len(ids))  # fmt: skip
+
+
+class Asked:
+    """Answers in turn, and what was asked."""
+
+    def __init__(self, *answers: JointFit):
+        self.answers, self.of = list(answers), []
+
+    def __call__(self, some: Tracks) -> JointFit:
+        self.of.append(some)
+        return self.answers[len(self.of) - 1]
+
+
+def edges() -> Tracks:
+    return tracks(EDGES, 30.0)
+
+
+def never() -> Tracks:
+    raise AssertionError("edges were followed")
+
+
+POINT_IDS, BOTH_IDS = np.arange(10, 20), np.arange(20, POINTS + EDGES)
+
+
+def test_a_joint_that_was_found_is_left_alone():
+    fit = joint("ambiguous", POINT_IDS)
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked()) is fit
+
+
+@pytest.mark.parametrize("why", ["a hand holds the camera", "nothing is known of shadows"])
+def test_edges_are_not_followed_where_they_say_nothing(why):
+    video = replace(VIDEO, warp=np.tile(np.eye(3), (T, 1, 1))) if why.startswith("a hand") else VIDEO
+    some = tracks(POINTS, 20.0) if why.startswith("a hand") else replace(tracks(POINTS, 20.0), cast=None)
+    assert unless_rims_tell(REFUSED, video, some, never, Asked()) is REFUSED
+
+
+def test_a_sure_answer_without_all_shadows_counts_but_is_doubtful():
+    ask = Asked(joint("ok", BOTH_IDS))
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
+    assert out.verdict == "ambiguous"
+    assert "straight edges" in out.reason
+    assert out.std["axis_deg"] == FACTOR * 4.0
+    assert max(out.type_probability.values()) < 0.9
+    seen = ask.of[0].visible.any(1)
+    assert len(seen) == POINTS + EDGES
+    assert not seen[:5].any()
+    assert seen[POINTS:].all()
+
+
+def test_its_points_are_those_of_points():
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(joint("ok", BOTH_IDS)))
+    assert np.array_equal(out.point_track, np.arange(20, POINTS))
+    assert len(out.points) == POINTS - 20
+    assert out.tracks == POINTS
+
+
+def test_what_is_only_off_shadows_edges_is_asked_second():
+    doubtful, other = joint("ambiguous", BOTH_IDS), joint("ambiguous", POINT_IDS)
+    ask = Asked(doubtful, other)
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
+    assert np.array_equal(out.point_track, POINT_IDS)
+    assert np.array_equal(ask.of[1].visible[:POINTS].any(1), np.arange(POINTS) >= 5)
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, Asked(doubtful, REFUSED))
+    assert np.array_equal(out.point_track, np.arange(20, POINTS))
+
+
+def test_what_edges_alone_follow_is_no_joint_of_a_part():
+    alone = joint("ok", np.arange(POINTS - 3, POINTS + EDGES))
+    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone)) is REFUSED
+
+
+def test_without_edges_nothing_is_asked():
+    none = lambda: tracks(0, 0.0)  # noqa: E731
+    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), none, Asked()) is REFUSED
