@@ -25,8 +25,8 @@ from reconstruct.joint.uncertainty import spread
 WORTH_DEG = 1.5
 """Standard deviation of an axis below which the tracks are believed as they are."""
 FEWEST = 20
-"""Tracks: a plane can be laid through fewer by nearly any link (13 of a stapler's made a sure plate, 68 deg off; rendered
-scissors that were found so have 26 and more)."""
+"""Tracks: nearly any plane can be laid through fewer. 13 of a stapler's made a sure plate, 68 deg off; of scissors that
+were found so the fewest are 26."""
 FLAT = 0.03
 """Standard deviation, over the link's size, by which points of a plate leave its plane: it has a thickness."""
 PLANES, STEEP = 500, 0.2
