@@ -30,7 +30,7 @@ from reconstruct.joint.parallels import along_edges
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.plates import as_plate
-from reconstruct.joint.result import MIN_INLIERS, result_of, why_not_believed
+from reconstruct.joint.result import FREELY, MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
     explained,
@@ -466,7 +466,7 @@ def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
     free = free_motion(s, obs)
     if free is not None and free.unexplained > FREE_SHARE:
         return (
-            f"the part moves as a free body, not about one joint: {free.unexplained:.0%} of its points that move most "
+            f"{FREELY}, not about one joint: {free.unexplained:.0%} of its points that move most "
             f"do not follow the best joint ({s.kind}, median residual {free.joint_px:.1f} px against "
             f"{free.free_px:.1f} px for a free rigid body, working pixels)"
         )

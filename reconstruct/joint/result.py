@@ -19,6 +19,8 @@ BRIDGED_SHARE, BRIDGED_ERROR = 0.3, 0.3
 LOOSER, RESTLESS = 2.75, 3.0
 """A joint is refuted if its own points follow a free body so many times better, and miss the joint by so many times
 what points at rest leave their place: a stabilised hand-held camera moves everything, and a free body with it."""
+FREELY = "the part moves as a free body"
+"""What a reason says of a joint that a body which is carried refutes."""
 SLID_PX = 2.0
 """Working px, median, that a track may have slid along its edge for its point to be handed on."""
 
@@ -33,7 +35,7 @@ def why_not_believed(done: Finished, restlessness: float = np.inf) -> str | None
     turn = turn_deg(bundle)
     if bundle.kind == "screw" and turn < SCREW_TURN_DEG:
         return (
-            f"the part moves as a free body: it turns by {turn:.0f} deg and advances along that axis, which any "
+            f"{FREELY}: it turns by {turn:.0f} deg and advances along that axis, which any "
             f"body does that is carried a short way (a screw is believed from {SCREW_TURN_DEG:.0f} deg on)"
         )
     b = bridged(bundle, done.sight)
@@ -48,7 +50,7 @@ def why_not_believed(done: Finished, restlessness: float = np.inf) -> str | None
     times = looser(bundle, done.sight) if misses else None
     if times is not None and times > LOOSER:
         return (
-            f"the part moves as a free body: its points follow one {times:.2g} times more exactly than the best joint "
+            f"{FREELY}: its points follow one {times:.2g} times more exactly than the best joint "
             f"({bundle.kind})"
         )
     return None

@@ -16,12 +16,12 @@ import numpy as np
 from reconstruct.cues import Tracks
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
-from reconstruct.joint.result import MIN_INLIERS
+from reconstruct.joint.result import FREELY, MIN_INLIERS
 from reconstruct.joint.shadows import maybe_shadows, without
 from reconstruct.video import Video
 
 FACTOR = 2.0
-"""How many times what is stated such joints are off (the root of the mean square of ten rendered ones, 0.1 to 3.6)."""
+"""How many times what is stated such joints are off (the root of the mean square of nine rendered ones, 0.1 to 3.6)."""
 WORDS = "its points alone show no joint, with its straight edges"
 
 
@@ -29,15 +29,16 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
                      ask: Callable[[Tracks], JointFit]) -> JointFit:  # fmt: skip
     """The joint, or where it is refused what points and straight edges together follow, doubtful in any case.
 
-    They are asked without all that may be a shadow, and a sure answer counts; else without the edges of shadows, and
-    what is found counts; else what was found first.
+    Not where a body that is carried freely refutes it: a few edges of that follow some hinge. They are asked without
+    all that may be a shadow, and a sure answer counts; else without the edges of shadows, and what is found counts;
+    else what was found first.
 
     Args:
         fit: the joint of the points, or a refusal.
         rims: for the moving straight edges that are no shadow's and on no arm, as tracks of the same video.
         ask: for the joint of some tracks.
     """
-    if fit.verdict != "refused" or video.warp is not None or tracks.cast is None:
+    if fit.verdict != "refused" or FREELY in fit.reason or video.warp is not None or tracks.cast is None:
         return fit
     edges = rims()
     if not len(edges.uv):

@@ -8,6 +8,7 @@ import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.models import JointFit
+from reconstruct.joint.result import FREELY
 from reconstruct.joint.rims import FACTOR, unless_rims_tell
 from reconstruct.video import Video
 
@@ -51,6 +52,11 @@ def edges() -> Tracks:
 
 def never() -> Tracks:
     raise AssertionError("edges were followed")
+
+
+def test_what_is_carried_freely_is_not_asked_for_its_edges():
+    fit = JointFit("refused", f"{FREELY}: its points follow one 3.1 times more exactly than the best joint (revolute)")
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked()) is fit
 
 
 POINT_IDS, BOTH_IDS = np.arange(10, 20), np.arange(20, POINTS + EDGES)
