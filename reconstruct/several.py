@@ -48,7 +48,8 @@ def joint_beside(video: Video, tracks: Tracks, fit: JointFit, other: OtherPart, 
     T[:3, 3] *= factor
     made = placed(made, np.linalg.inv(fit.T_camera_world) @ T, factor)
     words = f"{made.reason}; its distance is that of the first link's front"
-    return replace(made, reason=words, point_track=rows[made.point_track], tracks=len(tracks.uv))
+    members = None if made.members is None else rows[made.members]
+    return replace(made, reason=words, point_track=rows[made.point_track], members=members, tracks=len(tracks.uv))
 
 
 def _front_depth(fit: JointFit, made: JointFit) -> float:

@@ -65,6 +65,8 @@ class JointFit:
         moving_frames: (T,) bool, the frames in which the part moves.
         further: joints of other links of the same object, each on the static one, in the same world and scale.
         alone_deg: standard deviation of the axis by its tracks alone, where edges of the picture gave it; else None.
+        members: (n,) indices of all tracks that it was fitted to, also of those that slid along an edge and are no
+            points; None with depth.
     """
 
     verdict: str
@@ -90,6 +92,7 @@ class JointFit:
     moving_frames: np.ndarray | None = None
     further: tuple[JointFit, ...] = ()
     alone_deg: float | None = None
+    members: np.ndarray | None = None
 
     @property
     def unit(self) -> str:

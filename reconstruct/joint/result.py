@@ -132,7 +132,7 @@ def result_of(
         tracks=tracks,
         moving_frames=_moving_frames(q, video.time),
     )
-    return replace(fit, image_line=image_line(fit), alone_deg=done.alone_deg)
+    return replace(fit, image_line=image_line(fit), alone_deg=done.alone_deg, members=done.members)
 
 
 def stay(b: Bundle, s: Sightings) -> np.ndarray:

@@ -57,13 +57,16 @@ def _joined(points: Tracks, edges: Tracks) -> Tracks:
 
 
 def _answer(fit: JointFit, points: int) -> JointFit | None:
-    """A joint as one of so many points, without what it knows of edges; None if none was found, or it has no points."""
-    if fit.verdict == "refused" or fit.points is None or fit.point_track is None:
+    """A joint as one of so many points, without what it knows of edges; None if none was found, or one without either.
+
+    What points follow alone has been refused for a reason: the shadow of a waving hand is a slide.
+    """
+    if fit.verdict == "refused" or fit.points is None or fit.point_track is None or fit.members is None:
         return None
-    own = fit.point_track < points
-    if own.sum() < MIN_INLIERS:
+    own, members = fit.point_track < points, fit.members[fit.members < points]
+    if own.sum() < MIN_INLIERS or len(fit.members) - len(members) < MIN_INLIERS:
         return None
-    return replace(fit, points=fit.points[own], point_track=fit.point_track[own], tracks=points)
+    return replace(fit, points=fit.points[own], point_track=fit.point_track[own], members=members, tracks=points)
 
 
 def _doubtful(fit: JointFit) -> JointFit:

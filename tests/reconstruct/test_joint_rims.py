@@ -32,7 +32,7 @@ def joint(verdict: str, ids: np.ndarray) -> JointFit:
     """A hinge that these tracks follow."""
     p, std = {"revolute": 0.99, "prismatic": 0.01}, {"axis_deg": 4.0, "point_m": 0.01}
     return JointFit(verdict, "tracks agree", "revolute", p, axis=np.array([0, 0, 1.0]), points=np.zeros((len(ids), 3)),
-                    point_track=ids, std=std, inliers=len(ids))  # fmt: skip
+                    point_track=ids, std=std, inliers=len(ids), members=ids)  # fmt: skip
 
 
 class Asked:
@@ -60,6 +60,7 @@ def test_what_is_carried_freely_is_not_asked_for_its_edges():
 
 
 POINT_IDS, BOTH_IDS = np.arange(10, 20), np.arange(20, POINTS + EDGES)
+OTHER_IDS = np.concatenate([POINT_IDS, np.arange(POINTS, POINTS + EDGES)])
 
 
 def test_a_joint_that_was_found_is_left_alone():
@@ -95,10 +96,11 @@ def test_its_points_are_those_of_points():
 
 
 def test_what_is_only_off_shadows_edges_is_asked_second():
-    doubtful, other = joint("ambiguous", BOTH_IDS), joint("ambiguous", POINT_IDS)
+    doubtful, other = joint("ambiguous", BOTH_IDS), joint("ambiguous", OTHER_IDS)
     ask = Asked(doubtful, other)
     out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
     assert np.array_equal(out.point_track, POINT_IDS)
+    assert np.array_equal(out.members, POINT_IDS)
     assert np.array_equal(ask.of[1].visible[:POINTS].any(1), np.arange(POINTS) >= 5)
     out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, Asked(doubtful, REFUSED))
     assert np.array_equal(out.point_track, np.arange(20, POINTS))
@@ -106,6 +108,11 @@ def test_what_is_only_off_shadows_edges_is_asked_second():
 
 def test_what_edges_alone_follow_is_no_joint_of_a_part():
     alone = joint("ok", np.arange(POINTS - 3, POINTS + EDGES))
+    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone)) is REFUSED
+
+
+def test_what_points_alone_follow_stays_refused():
+    alone = joint("ok", np.arange(10, POINTS + 3))
     assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone)) is REFUSED
 
 
