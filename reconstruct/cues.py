@@ -90,7 +90,7 @@ class Tracks:
     cast: np.ndarray | None = None
 
     def of(self, rows: np.ndarray) -> Tracks:
-        """Some of them."""
+        """Some of them: (k,) indices or (N,) bool."""
         some = [None if x is None else x[rows] for x in (self.slip, self.shade, self.cast)]
         return Tracks(self.uv[rows], self.visible[rows], self.reference[rows], self.provider, *some)
 

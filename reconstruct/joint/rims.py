@@ -70,6 +70,7 @@ def _answer(fit: JointFit, points: int) -> JointFit | None:
 
 
 def _doubtful(fit: JointFit) -> JointFit:
+    """The joint as `ambiguous`: its type half by the prior, its axis and place FACTOR times less sure."""
     p, std = or_by_prior(fit.type_probability), dict(fit.std)
     for k in ("axis_deg", "point_m"):
         if k in std:

@@ -39,7 +39,7 @@ STEP_PX, END_PX = 14.0, 4.0
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight edges of one picture, the brighter side on the left of each, seen along it with y down.
+    """Straight edges of one picture, the brighter side on the right of each for who looks along it.
 
     Attributes:
         middle: (n, 2) px.  along: (n, 2) unit.  length: (n,) px.  sides: (n, 2, 3) mean colour of either side.
@@ -132,7 +132,11 @@ class _Edge:
 
 
 def followed(every: list[Segments]) -> list[list[tuple[int, int]]]:
-    """Chains of segments, (frame, index), that are one edge."""
+    """Chains of segments, (frame, index into that frame's), that are one edge; in the order of time.
+
+    Args:
+        every: T frames' segments.
+    """
     live: list[_Edge] = []
     out: list[_Edge] = []
     for t, here in enumerate(every):

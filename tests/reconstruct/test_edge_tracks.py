@@ -132,7 +132,7 @@ def test_a_shadows_edges_are_left_out():
     assert long_sides(on_shadow).sum() <= 0.2 * long_sides(on_bar).sum()
 
 
-def test_the_brighter_side_is_on_the_left_of_a_segment():
+def test_the_brighter_side_is_on_the_right_of_a_segment():
     video = film()
     seen = pictures(video)
     found = segments(seen.grey[0], video.frames[0], seen.covered[0])
