@@ -322,11 +322,13 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     they were many, the wedge of an arm may have held the part: then all tracks are asked, and a joint that is not
     mostly an arm's counts. Shadows go nearly as the part goes too. What may be the edge of one is left out where enough
     else moves, and asked where nothing is found without it. What one straight edge alone follows is no sure joint.
-    Where nothing is found at all, the part's straight edges are followed and asked too.
+    Where a body refutes it that is carried freely, what the hands carry is left out. Where nothing is found at all, the
+    part's straight edges are followed and asked too.
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.edges import unless_one_edge
     from reconstruct.joint.fit import fit_joint, moving_tracks
+    from reconstruct.joint.handling import unless_carried
     from reconstruct.joint.rims import unless_rims_tell
     from reconstruct.joint.shadows import off_shadows, unless_a_shadow
     from reconstruct.providers.edge_tracks import edge_tracks
@@ -356,6 +358,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
         again = unless_one_edge(off_shadows_too(tracks), video, tracks, off_shadows_too)
         if again.verdict != "refused" and np.mean(arm[again.point_track]) < 0.5:
             return again
+    fit = unless_carried(fit, video, rest, hands, off_shadows_too)
     fit = unless_rims_tell(fit, video, rest, rims, ask)
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
