@@ -1,4 +1,4 @@
-"""A part whose points show no joint, asked again with its straight edges.
+"""A part whose points show no joint, or leave its axis open, asked again with its straight edges.
 
 Parts of even paint, and small ones, have few points, which are lost within a few frames, and shadows have many: what is
 left when those are taken away follows nothing, and the joint is refused. The straight edges that move and are no
@@ -14,40 +14,50 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.cues import Tracks
+from reconstruct.joint.answers import alone_deg
 from reconstruct.joint.kinds import or_by_prior
-from reconstruct.joint.models import JointFit
+from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.result import FREELY, MIN_INLIERS
 from reconstruct.joint.shadows import maybe_shadows, without
 from reconstruct.video import Video
 
 FACTOR = 2.0
 """How many times what is stated such joints are off (the root of the mean square of nine rendered ones, 0.1 to 3.6)."""
-WORDS = "its points alone show no joint, with its straight edges"
+SHOW_NONE = "its points alone show no joint, with its straight edges"
+LEAVE_OPEN = "its points alone leave the axis open, with its straight edges"
 
 
 def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable[[], Tracks],
                      ask: Callable[[Tracks], JointFit]) -> JointFit:  # fmt: skip
-    """The joint, or where it is refused what points and straight edges together follow, doubtful in any case.
+    """The joint, or where it is refused or its axis is open what points and straight edges together follow, doubtful
+    in any case.
 
-    Not where a body that is carried freely refutes it: a few edges of that follow some hinge. They are asked without
-    all that may be a shadow, and a sure answer counts; else without the edges of shadows, and what is found counts;
-    else what was found first.
+    Not where a body that is carried freely refutes it: a few edges of that follow some hinge. Where it is refused they
+    are asked without all that may be a shadow, and a sure answer counts; else without the edges of shadows, and what is
+    found counts; else what was found first. Where the axis is open, known to VAGUE_DEG or worse by points alone, they
+    are asked without the edges of shadows, and what is found counts if it is known better.
 
     Args:
         fit: the joint of the points, or a refusal.
         rims: for the moving straight edges that are no shadow's and on no arm, as tracks of the same video.
         ask: for the joint of some tracks.
     """
-    if fit.verdict != "refused" or FREELY in fit.reason or video.warp is not None or tracks.cast is None:
+    if FREELY in fit.reason or video.warp is not None or tracks.cast is None:
+        return fit
+    refused = fit.verdict == "refused"
+    if not refused and not (fit.verdict == "ambiguous" and alone_deg(fit) > VAGUE_DEG):
         return fit
     edges = rims()
     if not len(edges.uv):
         return fit
+    if not refused:
+        found = _answer(ask(_joined(without(tracks, tracks.cast), edges)), len(tracks.uv))
+        return fit if found is None or alone_deg(found) >= alone_deg(fit) else _doubtful(found, LEAVE_OPEN)
     lit = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), len(tracks.uv))
     if lit is not None and lit.verdict == "ok":
-        return _doubtful(lit)
+        return _doubtful(lit, SHOW_NONE)
     found = _answer(ask(_joined(without(tracks, tracks.cast), edges)), len(tracks.uv)) or lit
-    return fit if found is None else _doubtful(found)
+    return fit if found is None else _doubtful(found, SHOW_NONE)
 
 
 def _joined(points: Tracks, edges: Tracks) -> Tracks:
@@ -69,10 +79,10 @@ def _answer(fit: JointFit, points: int) -> JointFit | None:
     return replace(fit, points=fit.points[own], point_track=fit.point_track[own], members=members, tracks=points)
 
 
-def _doubtful(fit: JointFit) -> JointFit:
+def _doubtful(fit: JointFit, words: str) -> JointFit:
     """The joint as `ambiguous`: its type half by the prior, its axis and place FACTOR times less sure."""
     p, std = or_by_prior(fit.type_probability), dict(fit.std)
     for k in ("axis_deg", "point_m"):
         if k in std:
             std[k] = FACTOR * std[k]
-    return replace(fit, verdict="ambiguous", reason=f"{WORDS}, {fit.reason}", type_probability=p, std=std)
+    return replace(fit, verdict="ambiguous", reason=f"{words}, {fit.reason}", type_probability=p, std=std)

@@ -28,9 +28,9 @@ def tracks(count: int, x: float, cast: int = 0) -> Tracks:
                   np.zeros((count, T, 2), np.float32), on.copy(), on)  # fmt: skip
 
 
-def joint(verdict: str, ids: np.ndarray) -> JointFit:
+def joint(verdict: str, ids: np.ndarray, axis_deg: float = 4.0) -> JointFit:
     """A hinge that these tracks follow."""
-    p, std = {"revolute": 0.99, "prismatic": 0.01}, {"axis_deg": 4.0, "point_m": 0.01}
+    p, std = {"revolute": 0.99, "prismatic": 0.01}, {"axis_deg": axis_deg, "point_m": 0.01}
     return JointFit(verdict, "tracks agree", "revolute", p, axis=np.array([0, 0, 1.0]), points=np.zeros((len(ids), 3)),
                     point_track=ids, std=std, inliers=len(ids), members=ids)  # fmt: skip
 
@@ -63,9 +63,27 @@ POINT_IDS, BOTH_IDS = np.arange(10, 20), np.arange(20, POINTS + EDGES)
 OTHER_IDS = np.concatenate([POINT_IDS, np.arange(POINTS, POINTS + EDGES)])
 
 
-def test_a_joint_that_was_found_is_left_alone():
-    fit = joint("ambiguous", POINT_IDS)
+@pytest.mark.parametrize("fit", [joint("ambiguous", POINT_IDS), joint("ok", POINT_IDS, 20.0)])
+def test_a_joint_whose_axis_is_known_is_left_alone(fit):
     assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked()) is fit
+
+
+def test_an_open_axis_is_taken_from_edges_that_know_it_better():
+    ask = Asked(joint("ok", OTHER_IDS, 6.0))
+    out = unless_rims_tell(joint("ambiguous", BOTH_IDS, 20.0), VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
+    assert out.verdict == "ambiguous" and "leave the axis open" in out.reason
+    assert out.std["axis_deg"] == FACTOR * 6.0 and np.array_equal(out.members, POINT_IDS)
+    assert np.array_equal(ask.of[0].visible.any(1), np.arange(POINTS + EDGES) >= 5)
+
+
+@pytest.mark.parametrize("found", [
+    joint("ok", OTHER_IDS, 21.0),
+    joint("ok", POINT_IDS, 6.0),  # by no edge
+    REFUSED,
+])  # fmt: skip
+def test_an_open_axis_stays_where_edges_know_it_no_better(found):
+    fit = joint("ambiguous", BOTH_IDS, 20.0)
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(found)) is fit
 
 
 @pytest.mark.parametrize("why", ["a hand holds the camera", "nothing is known of shadows"])
