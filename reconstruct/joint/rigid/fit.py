@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.rigid.bundle import (
     CUT,
@@ -340,6 +341,8 @@ def _result(st: State, obs: Observations, noise: Noise, probability: dict[str, f
         verdict = "ambiguous"
         reason = (f"{inliers} tracks with depth hold the axis to {std['axis_deg']:.0f} deg only; a larger motion would "
                   "tell")  # fmt: skip
+        # What holds the axis no better tells the types apart no better: five lights that go 1 px, one of them wrong.
+        probability = or_by_prior(probability)
     if kind == "screw":
         std["pitch"] = float(np.sqrt(max(wider * J["pitch"] @ cov_joint @ J["pitch"], 0.0)))
     px = np.linalg.norm(r[..., :2], axis=-1)[w > 0] * noise.px
