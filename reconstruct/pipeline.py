@@ -396,7 +396,8 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         return fit_from_cues(tracks, camera, depth, tracks_cue.get("xyz_world"), moving, video.size, metric, seed)
 
     with_depth = {key: given.get(key) for key in ("depth", "camera", "masks")} if ranged else None
-    parts = ("joint", "depth.py", "hand/forearm.py", "providers/edge_tracks.py", "providers/shade.py")
+    parts = ("joint", "depth.py", "hand/carried.py", "hand/forearm.py", "providers/edge_tracks.py",
+             "providers/shade.py")  # fmt: skip
     fit: JointFit = stages.run("joint", find, parts, options={"focal": focal, "with_depth": with_depth})
     if ranged and fit.verdict == "refused":
         notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")
