@@ -45,7 +45,7 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
     if FREELY in fit.reason or video.warp is not None or tracks.cast is None:
         return fit
     refused = fit.verdict == "refused"
-    if not refused and not (fit.verdict == "ambiguous" and alone_deg(fit) > VAGUE_DEG):
+    if not refused and not _open(fit):
         return fit
     edges = rims()
     if not len(edges.uv):
@@ -58,6 +58,11 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
         return _doubtful(lit, SHOW_NONE)
     found = _answer(ask(_joined(without(tracks, tracks.cast), edges)), len(tracks.uv)) or lit
     return fit if found is None else _doubtful(found, SHOW_NONE)
+
+
+def _open(fit: JointFit) -> bool:
+    """Whether a joint is doubtful and its axis known to VAGUE_DEG or worse by its tracks alone."""
+    return fit.verdict == "ambiguous" and "axis_deg" in fit.std and alone_deg(fit) > VAGUE_DEG
 
 
 def _joined(points: Tracks, edges: Tracks) -> Tracks:
