@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial import cKDTree
 
 from reconstruct.cues import Hands, HandTrack, Tracks
 from reconstruct.hand.forearm import KNUCKLE, WRIST
+from reconstruct.joint.paths import beside
 
 FRAMES = 6
 """Frames that have to show both the track and the hand."""
@@ -43,7 +43,7 @@ def carried(tracks: Tracks, hands: Hands) -> np.ndarray:
         a, b = np.where(np.isfinite(pose), pose, 1.0).T
         stays = _scatter((uv - b) / a)
         row[shown] = (goes > GOES * palm) & (stays < STAYS * goes)
-        row |= _beside(tracks, row, BESIDE * palm)
+        row |= beside(tracks.uv, tracks.visible, row, BESIDE * palm)
     return out
 
 
@@ -86,13 +86,3 @@ def _scatter(z: np.ndarray) -> np.ndarray:
     """(N,) RMS distance of each path (N, T) of complex numbers from its middle."""
     middle = np.nanmedian(z.real, axis=1) + 1j * np.nanmedian(z.imag, axis=1)
     return np.sqrt(np.nanmean(np.abs(z - middle[:, None]) ** 2, axis=1))
-
-
-def _beside(tracks: Tracks, some: np.ndarray, px: float) -> np.ndarray:
-    """(N,) bool, tracks within so many full px of one of some (N,) bool for more than half of their time."""
-    count = np.zeros(len(some), int)
-    for t in range(tracks.visible.shape[1]):
-        here, near = np.flatnonzero(tracks.visible[:, t]), some & tracks.visible[:, t]
-        if near.any():
-            count[here] += cKDTree(tracks.uv[near, t]).query(tracks.uv[here, t])[0] < px
-    return 2 * count > tracks.visible.sum(1)

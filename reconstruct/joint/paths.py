@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -66,3 +67,17 @@ def held(r: np.ndarray, slip: np.ndarray | None) -> np.ndarray:
     if r.ndim == slip.ndim:
         return r - slip * np.sum(slip * r, axis=-1, keepdims=True)
     return r - slip[..., None] * np.sum(slip[..., None] * r, axis=-2, keepdims=True)
+
+
+def beside(uv: np.ndarray, seen: np.ndarray, some: np.ndarray, px: float) -> np.ndarray:
+    """(N,) bool, tracks that are near one of some for more than half of the frames that show them.
+
+    Args:
+        uv: (N, T, 2) px.  seen: (N, T) bool.  some: (N,) bool.  px: how near.
+    """
+    near = np.zeros(len(seen), int)
+    for t in range(seen.shape[1]):
+        here, there = np.flatnonzero(seen[:, t]), some & seen[:, t]
+        if there.any():
+            near[here] += cKDTree(uv[there, t]).query(uv[here, t])[0] < px
+    return 2 * near > seen.sum(1)

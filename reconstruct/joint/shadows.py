@@ -11,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.answers import alone_deg, contradicts
 from reconstruct.joint.fit import moving_tracks
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
+from reconstruct.joint.paths import beside
 from reconstruct.video import Video
 
 LIT_TRACKS, LIT_SHARE = 40, 0.5
@@ -147,13 +147,7 @@ def maybe_shadows(video: Video, tracks: Tracks) -> np.ndarray:
     """
     assert tracks.cast is not None
     may = tracks.cast if tracks.shade is None else tracks.cast | tracks.shade
-    uv, seen = video.to_work(tracks.uv), tracks.visible
-    beside = np.zeros(len(seen), int)
-    for t in range(len(video)):
-        here, edge = np.flatnonzero(seen[:, t]), tracks.cast & seen[:, t]
-        if edge.any():
-            beside[here] += cKDTree(uv[edge, t]).query(uv[here, t])[0] < BESIDE_PX
-    return may | (2 * beside > seen.sum(1))
+    return may | beside(video.to_work(tracks.uv), tracks.visible, tracks.cast, BESIDE_PX)
 
 
 def _grey(tracks: Tracks) -> bool:

@@ -20,7 +20,7 @@ AXIS, HINGE = np.array([0.0, 1.0, 0.0]), np.array([-0.3, 0.0, 1.5])
 FREE = JointFit("refused", f"{FREELY}, not about one joint")
 
 
-def scene(seed: int = 0, sway_deg: float = 4.0) -> tuple[Tracks, Hands]:
+def scene(seed: int = 0) -> tuple[Tracks, Hands]:
     """A door that turns by 25 deg from frame 30 to 60, by a tool in a hand that comes from 0.2 m and leaves so.
 
     The first DOOR tracks are the door's, each seen for 30 frames, the next TOOL the tool's, the others the room's. The
@@ -33,7 +33,7 @@ def scene(seed: int = 0, sway_deg: float = 4.0) -> tuple[Tracks, Hands]:
     door = HINGE + np.stack([R.apply(p) for p in on_door])
     handle = HINGE + R.apply([0.55, 0.1, -0.05])
     off = 0.2 * np.clip(np.abs(t - 45) / 15 - 1, 0, 2)[:, None] / 2 * [0.6, 0.8, -0.2]
-    sway = Rotation.from_euler("xyz", np.radians(sway_deg) * np.sin(t[:, None] / [9.0, 14.0, 11.0] + [0, 1, 2]))
+    sway = Rotation.from_euler("xyz", np.radians(4) * np.sin(t[:, None] / [9.0, 14.0, 11.0] + [0, 1, 2]))
     carries = lambda p: handle + off + sway.apply(p)  # noqa: E731
     tool = np.stack([carries(p) for p in rng.uniform([-0.06, -0.16, -0.05], [0.06, -0.02, 0.05], (TOOL, 3))])
     room = np.repeat(rng.uniform([-0.8, -0.4, 1.6], [0.8, 0.4, 2.5], (ROOM, 1, 3)), T, axis=1)
