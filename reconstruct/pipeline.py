@@ -300,7 +300,7 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     if folder and scene is not None:
         folder = cues_io.CueFolder(scene, stages.chosen)
         given = folder.given()
-    tracks = stages.run("tracks", follow, tuple(f"providers/{n}.py" for n in ("lk_tracks", "affine", "shade")),
+    tracks = stages.run("tracks", follow, tuple(f"providers/{n}.py" for n in ("lk_tracks", "affine", "seeds", "shade")),
                         given=given.get("tracks"))  # fmt: skip
     if folder:
         folder.write("tracks", cues_io.track_arrays(tracks))

@@ -77,6 +77,7 @@ def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, p
         place: (N, 2) px, starts; becomes where the middles are.
         shape: (N, 2, 2) starts; becomes the derivative of the place in `now` by that in the anchor frame.
         noise: standard deviation of the frames' pixels, grey values.
+        half: half the window's side, px; the spread of its weight goes with it.
 
     Returns:
         (N,) normalised correlation of what belongs together in the neighbourhoods, as it would be without the noise
@@ -88,9 +89,10 @@ def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, p
     out = np.full(n, -2.0)
     wide = np.empty((side + 2, side + 2))
     bell = np.empty((side, side))
+    spread = SPREAD * half / HALF
     for a in range(side):
         for b in range(side):
-            bell[a, b] = exp(-((a - half) ** 2 + (b - half) ** 2) / (2 * SPREAD**2))
+            bell[a, b] = exp(-((a - half) ** 2 + (b - half) ** 2) / (2 * spread**2))
     bell /= bell.sum()
     weight, gap = np.empty((side, side)), np.empty((side, side))
     steep = np.empty((side, side, 6))
@@ -162,7 +164,7 @@ def register(frames: np.ndarray, anchor: np.ndarray, at: np.ndarray, now: int, p
                 # A window of so many observations; the prior counts as one.
                 small = 1e-6 * (H[4, 4] + H[5, 5]) + 1e-9
                 for c in range(6):
-                    H[c, c] += STIFF / (2 * np.pi * SPREAD**2 * share) if c < 4 else small
+                    H[c, c] += STIFF / (2 * np.pi * spread**2 * share) if c < 4 else small
                 inverse = np.linalg.inv(H)
             push[:] = 0.0
             level, along, square = 0.0, 0.0, 0.0

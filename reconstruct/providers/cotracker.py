@@ -73,7 +73,7 @@ def seeds(request: Request) -> np.ndarray:
     """(N, 3) float32 of (frame, x, y), working px: corners where the picture ever changes, hands left out."""
     import cv2
 
-    from reconstruct.providers.lk_tracks import _corners, change_region, even_exposure, reference_frames
+    from reconstruct.providers.seeds import change_region, corners, even_exposure, reference_frames
 
     video, hands = request.video, request.hands
     grey, region = even_exposure(video), change_region(video)
@@ -82,8 +82,8 @@ def seeds(request: Request) -> np.ndarray:
         free = region
         if hands is not None:
             free = region & ~(cv2.dilate(hands.mask[r].astype(np.uint8), np.ones((11, 11), np.uint8)) > 0)
-        corners = _corners(grey[r], free, SEEDS)
-        out.append(np.column_stack([np.full(len(corners), r, np.float32), corners]))
+        found = corners(grey[r], free, SEEDS)
+        out.append(np.column_stack([np.full(len(found), r, np.float32), found]))
     return np.concatenate(out).astype(np.float32) if out else np.zeros((0, 3), np.float32)
 
 

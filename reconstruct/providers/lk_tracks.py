@@ -5,7 +5,8 @@ corners. Corners are therefore seeded in every reference frame, wherever the pic
 in what changing places enclose, and followed forwards and backwards through the whole video. Every step is
 checked by tracking back, and each point is re-registered against the last frame in which it was well anchored
 (affine.py), so that errors do not pile up frame by frame. Where it no longer looks like that, beyond what the pixels'
-noise explains, another track begins.
+noise explains, another track begins. The grain of even paint is followed by wider windows, and no further than it is
+recognised.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ import numpy as np
 
 from reconstruct.cues import Hands, ProviderInfo, Tracks
 from reconstruct.joint.photometric import Pictures
-from reconstruct.providers.affine import SPREAD, register
+from reconstruct.providers.affine import HALF, SPREAD, register
+from reconstruct.providers.seeds import even_exposure, pixel_noise, reference_frames, seeds
 from reconstruct.providers.shade import BY_THEN, one_colour, rest_beneath
 from reconstruct.video import Video
 
-WINDOW = 15
+WINDOW, WIDE_WINDOW, WIDE_HALF = 15, 31, 14
+"""Sides of the windows that points are followed in, px, the second one's and half the one that they are registered in
+of points on faint surfaces."""
 FB_PX = 0.7
 """Forward-backward distance above which a step counts as lost, working px."""
 ANCHOR_PX = 2.0
@@ -31,74 +35,8 @@ LEAST_PIECE = 8
 """Frames for which a point has to be followed after it lost its anchor; what is shorter is mostly no point at all."""
 EDGE = 0.1
 """Ratio of the structure tensor's eigenvalues below which errors along an edge pile up."""
-CHANGE_GREY = 18.0
 SHADOW_PX = 2.0
 """Extent of a track, working px, from which on it may be a shadow's."""
-INNER_SEEDS, INNER_EVERY = 120, 3
-"""Seeds in what changing pixels enclose, in every third reference frame."""
-
-
-def reference_frames(video: Video, hands: Hands | None = None, count: int = 18) -> np.ndarray:
-    """(R,) working frames, spread evenly over picture change outside hands (first and last included)."""
-    import cv2
-
-    size = (video.frames.shape[2] // 4, video.frames.shape[1] // 4)
-    free = [np.ones(size[::-1], bool)] * len(video)
-    if hands is not None:
-        grow = np.ones((7, 7), np.uint8)
-        free = [cv2.dilate(cv2.resize(m.astype(np.uint8), size), grow) == 0 for m in hands.mask]
-    small = [cv2.resize(g, size, interpolation=cv2.INTER_AREA).astype(np.int16) for g in even_exposure(video)]
-    change = np.zeros(len(video))
-    for t in range(1, len(video)):
-        d = np.abs(small[t] - small[t - 1])
-        change[t] = np.mean(np.clip(d - 8, 0, 24) * (free[t] & free[t - 1]))
-    total = np.cumsum(change + 0.05 * change.mean() + 1e-6)
-    wanted = np.linspace(total[0], total[-1], count)
-    return np.unique(np.searchsorted(total, wanted).clip(0, len(video) - 1))
-
-
-def even_exposure(video: Video) -> list[np.ndarray]:
-    """T grey frames (h, w) uint8 with the exposure of the median picture.
-
-    An exposure that jumps drags points along edges. Gain and offset of each frame against the temporal median are
-    fitted robustly (what moves is a minority of the pixels); frames that agree within 3 % are left as they are.
-    """
-    import cv2
-
-    grey = [cv2.cvtColor(f, cv2.COLOR_BGR2GRAY) for f in video.frames]
-    size = (grey[0].shape[1] // 8, grey[0].shape[0] // 8)
-    small = np.stack([cv2.resize(g, size, interpolation=cv2.INTER_AREA) for g in grey]).reshape(len(grey), -1)
-    typical = np.median(small[:: max(1, len(grey) // 40)], axis=0)
-    # Saturated pixels say nothing about the gain.
-    usable = (typical > 8) & (typical < 247)
-    out = []
-    for g, row in zip(grey, small.astype(float), strict=True):
-        use = usable & (row > 4) & (row < 251)
-        if use.sum() < 50 or np.std(row[use]) < 4:
-            out.append(g)
-            continue
-        x, y, w = row[use], typical[use], np.ones(use.sum())
-        gain, offset = 1.0, 0.0
-        for _ in range(8):
-            gain, offset = np.polyfit(x, y, 1, w=np.sqrt(w))
-            w = 1 / (1 + ((gain * x + offset - y) / 6.0) ** 2)
-        same = abs(gain - 1) < 0.03 and abs(offset + (gain - 1) * x.mean()) < 4
-        out.append(g if same else np.clip(gain * g.astype(np.float32) + offset, 0, 255).astype(np.uint8))
-    return out
-
-
-def pixel_noise(grey: np.ndarray) -> float:
-    """Standard deviation, grey values, of what a pixel's value changes by from frame to frame where nothing moves.
-
-    The median over the picture and time; between whole numbers it is interpolated.
-    """
-    if len(grey) < 2:
-        return 0.0
-    changes = np.abs(np.diff(grey[:, ::2, ::2].astype(np.int16), axis=0))
-    below = np.cumsum(np.bincount(changes.ravel(), minlength=256)) / changes.size
-    # A change of k stands for k - 1/2 to k + 1/2.
-    middle = float(np.interp(0.5, np.r_[0.0, below], np.r_[0.0, np.arange(len(below)) + 0.5]))
-    return middle / (0.6745 * np.sqrt(2))
 
 
 def pictures_of(video: Video, hands: Hands | None = None) -> Pictures:
@@ -113,34 +51,6 @@ def pictures_of(video: Video, hands: Hands | None = None) -> Pictures:
     return Pictures(np.stack(even_exposure(video)), covered, np.array([(w - 1) / 2, (h - 1) / 2]))
 
 
-def change_region(video: Video, dilate: int = 9) -> np.ndarray:
-    """(h, w) bool, pixels whose smoothed brightness ever differs clearly from another time's."""
-    import cv2
-
-    step = max(1, len(video) // 80)
-    low = high = None
-    for f in even_exposure(video)[::step]:
-        g = cv2.GaussianBlur(f, (0, 0), 1.5)
-        low = g if low is None else np.minimum(low, g)
-        high = g if high is None else np.maximum(high, g)
-    region = (high.astype(np.int16) - low) > CHANGE_GREY
-    region = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    return cv2.dilate(region, np.ones((2 * dilate + 1,) * 2, np.uint8)) > 0
-
-
-def enclosed(region: np.ndarray) -> np.ndarray:
-    """(h, w) bool, what the pieces of a region enclose, without the region: a door of even colour that opens a little
-    changes the picture at its rim only, but the points near its hinge hold the axis best."""
-    import cv2
-
-    out = np.zeros(region.shape, np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8))
-    for k in range(1, len(stats)):
-        y, x = np.nonzero(labels == k)
-        cv2.fillConvexPoly(out, cv2.convexHull(np.stack([x, y], axis=1).astype(np.int32)), 1)
-    return (out > 0) & ~region
-
-
 def track_points(
     video: Video,
     hands: Hands | None = None,
@@ -148,13 +58,13 @@ def track_points(
     per_reference: int = 220,
     progress: Callable[[float], None] | None = None,
 ) -> Tracks:
-    """Seed and follow corners.
+    """Seed and follow corners, and the grain of faint surfaces.
 
     Args:
         video: stabilised video.
         hands: pixels under hands are neither seeded nor followed.
         references: (R,) frames in which to seed; chosen from the picture change when None.
-        per_reference: at most this many seeds a reference frame.
+        per_reference: at most this many corners a reference frame.
         progress: called with the done share in [0, 1].
 
     Returns:
@@ -163,28 +73,17 @@ def track_points(
     import cv2
 
     references = reference_frames(video, hands) if references is None else np.asarray(references)
-    region = change_region(video)
     seen = pictures_of(video, hands)
     grey, covered = seen.grey, seen.covered
     noise = pixel_noise(grey)
-    seeds, frames = [], []
-    inner = enclosed(region)
-    for k, r in enumerate(references):
-        free = ~covered[r]
-        p = _corners(grey[r], region & free, per_reference)
-        if k % INNER_EVERY == 0:
-            p = np.concatenate([p, _corners(grey[r], inner & free, INNER_SEEDS)])
-        seeds.append(p)
-        frames.append(np.full(len(p), r))
-    start = np.concatenate(seeds) if seeds else np.zeros((0, 2), np.float32)
-    reference = np.concatenate(frames).astype(int) if frames else np.zeros(0, int)
+    start, reference, wide = seeds(video, grey, covered, references, noise, per_reference)
     T = len(video)
     uv = np.full((len(start), T, 2), np.nan, np.float32)
     uv[np.arange(len(start)), reference] = start
     lost = np.zeros((len(start), T), bool)
     done = 0
     for order in (range(T), range(T - 1, -1, -1)):
-        _follow(grey, list(order), uv, lost, reference, covered, noise)
+        _follow(grey, list(order), uv, lost, reference, wide, covered, noise)
         done += 1
         if progress:
             progress(done / 2)
@@ -273,43 +172,13 @@ def slip_of(grey: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return out
 
 
-def _corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
-    """(N, 2) float32 corners: strongest first with spacing, weak ones allowed down to the noise level."""
-    import cv2
-
-    strength = cv2.cornerMinEigenVal(grey, 7)
-    strength[~mask] = 0
-    noise = np.median(cv2.cornerMinEigenVal(cv2.GaussianBlur(grey, (0, 0), 3), 7)) + 1e-7
-    local = strength == cv2.dilate(strength, np.ones((9, 9), np.uint8))
-    y, x = np.nonzero(local & (strength > max(8e-6, 4 * noise)))
-    order = np.argsort(-strength[y, x])[: 4 * count]
-    y, x = y[order], x[order]
-    # Half of the seeds go to the strongest corners, half are spread over cells so that weak surfaces get some.
-    cell = (y // 48) * 1000 + x // 48
-    rank = np.zeros(len(y), int)
-    seen: dict[int, int] = {}
-    for i, c in enumerate(cell):
-        rank[i] = seen.get(c, 0)
-        seen[c] = rank[i] + 1
-    pick = np.argsort(rank, kind="stable")[:count]
-    p = np.stack([x[pick], y[pick]], axis=-1).astype(np.float32)
-    if len(p):
-        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.02)
-        p = cv2.cornerSubPix(grey, p.reshape(-1, 1, 2).copy(), (4, 4), (-1, -1), criteria).reshape(-1, 2)
-    return p
-
-
 def _follow(
-    grey: np.ndarray, order: list[int], uv: np.ndarray, lost: np.ndarray, reference: np.ndarray, covered: np.ndarray,
-    noise: float,
+    grey: np.ndarray, order: list[int], uv: np.ndarray, lost: np.ndarray, reference: np.ndarray, wide: np.ndarray,
+    covered: np.ndarray, noise: float,
 ) -> None:  # fmt: skip
     """Extend all tracks along `order` and note where they lose their anchors (uv and lost, in place); each starts when
-    its reference frame comes up."""
-    import cv2
-
+    its reference frame comes up. The `wide` ones end there."""
     h, w = grey[0].shape
-    lk = dict(winSize=(WINDOW, WINDOW), maxLevel=3)
-    flags = dict(flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
     alive = np.zeros(len(uv), bool)
     anchor = reference.copy()
     shape = np.tile(np.eye(2), (len(uv), 1, 1))
@@ -319,11 +188,12 @@ def _follow(
         ids = np.flatnonzero(alive)
         if not len(ids):
             continue
-        p = uv[ids, s].reshape(-1, 1, 2)
-        n, ok, _ = cv2.calcOpticalFlowPyrLK(grey[s], grey[t], p, p + velocity[ids, None], **flags, **lk)
-        b, ok2, _ = cv2.calcOpticalFlowPyrLK(grey[t], grey[s], n, p.copy(), **flags, **lk)
-        good = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(b - p, axis=-1).ravel() < FB_PX)
-        n = n.reshape(-1, 2)
+        n, good = uv[ids, s] + velocity[ids], np.zeros(len(ids), bool)
+        for broad in (False, True):
+            some = wide[ids] == broad
+            if some.any():
+                window = WIDE_WINDOW if broad else WINDOW
+                n[some], good[some] = _step(grey[s], grey[t], uv[ids[some], s], n[some], window)
         x, y = n[:, 0], n[:, 1]
         good &= (x > 4) & (y > 4) & (x < w - 5) & (y < h - 5)
         inside = good.copy()
@@ -334,19 +204,36 @@ def _follow(
         uv[ids, t] = n
         # Against each point's anchor frame, with the shear since then; where it no longer looks alike, the last frame
         # becomes the anchor.
-        fine = _anchored(grey, ids, t, uv, anchor, shape, noise)
-        lost[ids[~fine], t] = True
-        anchor[ids[~fine]], shape[ids[~fine]] = s, np.eye(2)
-        _anchored(grey, ids[~fine], t, uv, anchor, shape, noise)
+        broad, fine = ids[wide[ids]], ids[~wide[ids]]
+        worse = fine[~_anchored(grey, fine, t, uv, anchor, shape, noise, HALF)]
+        lost[worse, t] = True
+        anchor[worse], shape[worse] = s, np.eye(2)
+        _anchored(grey, worse, t, uv, anchor, shape, noise, HALF)
+        # Of grain that does not look like itself only noise is left.
+        worse = broad[~_anchored(grey, broad, t, uv, anchor, shape, noise, WIDE_HALF)]
+        uv[worse, t], alive[worse] = np.nan, False
         velocity[ids] = uv[ids, t] - uv[ids, s]
 
 
+def _step(before: np.ndarray, after: np.ndarray, p: np.ndarray, guess: np.ndarray,
+          window: int) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Points (n, 2) float32 one frame on, and (n,) bool whether they lead back."""
+    import cv2
+
+    lk = dict(winSize=(window, window), maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    p, guess = p.reshape(-1, 1, 2), guess.reshape(-1, 1, 2)
+    n, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, p, guess.copy(), **lk)
+    b, ok2, _ = cv2.calcOpticalFlowPyrLK(after, before, n, p.copy(), **lk)
+    good = (ok.ravel() > 0) & (ok2.ravel() > 0) & (np.linalg.norm(b - p, axis=-1).ravel() < FB_PX)
+    return n.reshape(-1, 2), good
+
+
 def _anchored(grey: np.ndarray, ids: np.ndarray, t: int, uv: np.ndarray, anchor: np.ndarray, shape: np.ndarray,
-              noise: float) -> np.ndarray:  # fmt: skip
+              noise: float, half: int) -> np.ndarray:  # fmt: skip
     """Register points in frame t against their anchor frames, in place; (n,) bool where that succeeded."""
     place, turned = uv[ids, t].astype(float), shape[ids]
     before = place.copy()
-    alike = register(grey, anchor[ids], uv[ids, anchor[ids]].astype(float), t, place, turned, noise)
+    alike = register(grey, anchor[ids], uv[ids, anchor[ids]].astype(float), t, place, turned, noise, half)
     stretch = np.linalg.svd(turned, compute_uv=False)
     fine = (alike > ALIKE) & (np.linalg.norm(place - before, axis=-1) < ANCHOR_PX)
     fine &= (stretch[:, 0] < STRETCH) & (stretch[:, 1] > 1 / STRETCH)

@@ -47,7 +47,7 @@ def version() -> str:
 
 def tracks(request: Request) -> Made:
     """``tracks.npz`` from matches to several reference frames."""
-    from reconstruct.providers.lk_tracks import change_region, even_exposure, reference_frames
+    from reconstruct.providers.seeds import change_region, even_exposure, reference_frames
 
     video, hands = request.video, request.hands
     grey = even_exposure(video)

@@ -6,15 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reconstruct.cues import Hands, ProviderInfo
-from reconstruct.providers.lk_tracks import (
-    LEAST_PIECE,
+from reconstruct.providers.lk_tracks import LEAST_PIECE, pieces, track_points
+from reconstruct.providers.seeds import (
+    GRAIN_APART,
     change_region,
     enclosed,
     even_exposure,
-    pieces,
+    faint_surface,
+    grain,
     pixel_noise,
     reference_frames,
-    track_points,
 )
 from tests.reconstruct.joint_scenes import make_video
 from tests.reconstruct.textures import turning_plate
@@ -120,6 +121,60 @@ def test_faint_texture_in_noise_is_followed_by_its_first_picture(monkeypatch):
     untold = off()
     assert np.median(told) < 0.35
     assert (told < 1).sum() > 2 * (untold < 1).sum()
+
+
+def dark_plate(T: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A turning dark plate of even paint before a bright wall, a sensor whose noise grows with the light; (T, h, w, 3)
+    uint8 and homographies from frame 0."""
+    H = turning_plate(T)[1]
+    grain = cv2.GaussianBlur(rng.standard_normal((360, 480)), (0, 0), 1.5)
+    paint = np.zeros_like(grain)
+    paint[100:280, 160:350] = 45 + 1.1 * grain[100:280, 160:350] / grain.std()
+    seen = np.stack([cv2.warpPerspective(paint, h, paint.shape[::-1]) for h in H])
+    light = np.where(seen > 25, seen, 180)
+    noisy = light + rng.normal(size=light.shape) * (0.9 + 0.006 * light)
+    return np.repeat(np.clip(noisy + 0.5, 0, 255).astype(np.uint8)[..., None], 3, axis=-1), H
+
+
+def test_grain_of_a_dark_surface_is_followed_by_wide_windows(monkeypatch):
+    """Where corners are lost after a few frames."""
+    frames, H = dark_plate(16, np.random.default_rng(0))
+    video = make_video(len(frames)).with_frames(frames)
+
+    def right() -> tuple[int, float]:
+        """Observations well inside the plate, after 4 px or more, that are right to 1 px, and their share."""
+        tracks, off = track_points(video), []
+        for uv, r in zip(tracks.uv.astype(float), tracks.reference, strict=True):
+            base = cv2.perspectiveTransform(uv[r].reshape(1, 1, 2), np.linalg.inv(H[r]))
+            if 180 < base[0, 0, 0] < 330 and 120 < base[0, 0, 1] < 260:
+                true = np.array([cv2.perspectiveTransform(base, h)[0, 0] for h in H])
+                gone = np.linalg.norm(true - true[r], axis=1) > 4
+                off.append(np.linalg.norm(true - uv, axis=-1)[gone & np.isfinite(uv[:, 0])])
+        err = np.concatenate(off)
+        return int((err < 1).sum()), float(np.mean(err < 1))
+
+    number, share = right()
+    monkeypatch.setattr("reconstruct.providers.seeds.faint_surface", lambda grey, noise: np.zeros(grey.shape, bool))
+    before, _ = right()
+    assert number > 2 * before and share > 0.8
+
+
+def test_faint_is_what_varies_no_more_than_noise_and_seeds_spread_over_it():
+    frames, _ = dark_plate(2, np.random.default_rng(1))
+    grey = np.stack(even_exposure(make_video(2).with_frames(frames)))
+    faint = faint_surface(grey[0], pixel_noise(grey))
+    assert faint[140:240, 200:310].mean() > 0.9
+    rim = np.zeros_like(faint)
+    rim[92:108, 170:340] = True
+    assert not faint[rim].any()
+    inside = np.zeros_like(faint)
+    inside[140:240, 200:310] = True
+    p = grain(grey[0], faint & inside)
+    x, y = p.round().astype(int).T
+    assert len(p) > 30 and inside[y, x].all()
+    apart = np.linalg.norm(p[:, None] - p[None], axis=-1)[~np.eye(len(p), dtype=bool)]
+    assert apart.min() >= GRAIN_APART
+    assert grain(grey[0], np.zeros_like(faint)).shape == (0, 2)
 
 
 def test_what_was_lost_is_another_track_afterwards():
