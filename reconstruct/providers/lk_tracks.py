@@ -23,8 +23,8 @@ from reconstruct.providers.shade import BY_THEN, one_colour, rest_beneath
 from reconstruct.video import Video
 
 WINDOW, WIDE_WINDOW, WIDE_HALF = 15, 31, 14
-"""Sides of the windows that points are followed in, px, the second one's and half the one that they are registered in
-of points on faint surfaces."""
+"""Side of the window that points are followed in, px; the same of points on faint surfaces, and half the side of the
+window that these are registered in."""
 FB_PX = 0.7
 """Forward-backward distance above which a step counts as lost, working px."""
 ANCHOR_PX = 2.0

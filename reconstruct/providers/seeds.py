@@ -1,8 +1,8 @@
 """Where points are seeded to be followed: in which frames, in which part of the picture, and on what.
 
 Corners hold a point best. A dark surface of even paint has none, only its grain, which with the pixels' own noise is
-fainter than that of brighter pixels: points are spread over it and followed by wide windows. Most of those that move
-are right, and hardly any is a shadow's, as there is no edge about their seeds (docs/notes/joint.md, "Grain").
+fainter than that of brighter pixels: points are spread over it and followed by wide windows. Hardly any of those that
+move is a shadow's, as there is no edge about their seeds (docs/notes/joint.md, "Grain").
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def even_exposure(video: Video) -> list[np.ndarray]:
 def pixel_noise(grey: np.ndarray) -> float:
     """Standard deviation, grey values, of what a pixel's value changes by from frame to frame where nothing moves.
 
-    The median over the picture and time; between whole numbers it is interpolated.
+    The median over the picture and time of frames (T, h, w) uint8; between whole numbers it is interpolated.
     """
     if len(grey) < 2:
         return 0.0
@@ -89,7 +89,7 @@ def pixel_noise(grey: np.ndarray) -> float:
 
 
 def change_region(video: Video, dilate: int = 9) -> np.ndarray:
-    """(h, w) bool, pixels whose smoothed brightness ever differs clearly from another time's."""
+    """(h, w) bool, working pixels whose smoothed brightness ever differs clearly from another time's."""
     import cv2
 
     step = max(1, len(video) // 80)
@@ -104,8 +104,8 @@ def change_region(video: Video, dilate: int = 9) -> np.ndarray:
 
 
 def enclosed(region: np.ndarray) -> np.ndarray:
-    """(h, w) bool, what the pieces of a region enclose, without the region: a door of even colour that opens a little
-    changes the picture at its rim only, but the points near its hinge hold the axis best."""
+    """(h, w) bool, what the pieces of a region (h, w) bool enclose, without the region: a door of even colour that
+    opens a little changes the picture at its rim only, but the points near its hinge hold the axis best."""
     import cv2
 
     out = np.zeros(region.shape, np.uint8)
@@ -117,7 +117,8 @@ def enclosed(region: np.ndarray) -> np.ndarray:
 
 
 def corners(grey: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
-    """(N, 2) float32 corners: strongest first with spacing, weak ones allowed down to the noise level."""
+    """(N, 2) float32 px, at most so many corners of a picture (h, w) uint8 within the mask (h, w) bool: strongest first
+    with spacing, weak ones allowed down to the noise level."""
     import cv2
 
     strength = cv2.cornerMinEigenVal(grey, 7)

@@ -127,9 +127,9 @@ def dark_plate(T: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray
     """A turning dark plate of even paint before a bright wall, a sensor whose noise grows with the light; (T, h, w, 3)
     uint8 and homographies from frame 0."""
     H = turning_plate(T)[1]
-    grain = cv2.GaussianBlur(rng.standard_normal((360, 480)), (0, 0), 1.5)
-    paint = np.zeros_like(grain)
-    paint[100:280, 160:350] = 45 + 1.1 * grain[100:280, 160:350] / grain.std()
+    texture = cv2.GaussianBlur(rng.standard_normal((360, 480)), (0, 0), 1.5)
+    paint = np.zeros_like(texture)
+    paint[100:280, 160:350] = 45 + 1.1 * texture[100:280, 160:350] / texture.std()
     seen = np.stack([cv2.warpPerspective(paint, h, paint.shape[::-1]) for h in H])
     light = np.where(seen > 25, seen, 180)
     noisy = light + rng.normal(size=light.shape) * (0.9 + 0.006 * light)
