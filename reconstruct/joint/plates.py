@@ -144,7 +144,7 @@ def _starts(b: Bundle, s: Sightings) -> list[Bundle]:
     rays = np.concatenate([s.uv / f, np.ones((N, T, 1))], axis=2)
     middle = np.median(rays[s.seen], axis=0)
     tried = []
-    for normal in _half_sphere(PLANES):
+    for normal in half_sphere(PLANES):
         normal = normal * np.sign(normal @ middle)
         if normal @ middle < STEEP * np.linalg.norm(middle):
             continue
@@ -163,7 +163,7 @@ def _starts(b: Bundle, s: Sightings) -> list[Bundle]:
     return [_joint(b, s.seen, rays, normal, centre) for normal, centre in chosen]
 
 
-def _half_sphere(count: int) -> np.ndarray:
+def half_sphere(count: int) -> np.ndarray:
     """(count, 3) unit directions, evenly over half a sphere (a Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     z, turn = 1 - k / count, np.pi * (1 + np.sqrt(5)) * k
@@ -171,7 +171,7 @@ def _half_sphere(count: int) -> np.ndarray:
     return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
 
 
-def _basis(normal: np.ndarray) -> np.ndarray:
+def in_plane(normal: np.ndarray) -> np.ndarray:
     """(2, 3) unit, at right angles to each other and to a normal: turned about it the first becomes the other."""
     e = perpendicular_basis(normal)[:, 0]
     return np.stack([e, np.cross(normal, e)])
@@ -181,7 +181,7 @@ def _laid(rays: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Where rays (..., 3) meet the plane at distance 1 with this normal, as complex numbers in it; and whether they
     do so well before the camera's horizon of it."""
     d = rays @ normal
-    X = rays / np.where(np.abs(d) < 1e-3, 1e-3, d)[..., None] @ _basis(normal).T
+    X = rays / np.where(np.abs(d) < 1e-3, 1e-3, d)[..., None] @ in_plane(normal).T
     return X[..., 0] + 1j * X[..., 1], d > 0.02
 
 
@@ -198,7 +198,7 @@ def _turn(z: np.ndarray, seen: np.ndarray, normal: np.ndarray, uv: np.ndarray, f
     both[:, first] = False
     if both.sum() < 8:
         return None
-    a, W, basis = z[:, [first]], both.astype(float), _basis(normal)
+    a, W, basis = z[:, [first]], both.astype(float), in_plane(normal)
     off = np.zeros(1)
     for _ in range(ROUNDS):
         total = W.sum(0) + 1e-9
@@ -236,7 +236,7 @@ def _joint(b: Bundle, seen: np.ndarray, rays: np.ndarray, normal: np.ndarray, ce
         known = seen.any(1)
     q = np.unwrap(np.angle(u))
     x = x * u[0]
-    basis = _basis(normal)
+    basis = in_plane(normal)
     point = normal + centre.real * basis[0] + centre.imag * basis[1]
     X = point + x.real[:, None] * basis[0] + x.imag[:, None] * basis[1]
     unit = max(float(np.median(X[:, 2])), 1e-6)

@@ -8,7 +8,7 @@ points along each are handed on as tracks whose slip is all along it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,8 @@ LIFE = 6
 """Frames in which an edge has to be found, and a point on it seen."""
 MOVES_PX = 1.0
 """Way across its points have to go: what rests is nothing to fit."""
+MOSTLY = 0.5
+"""Share of an edge's points on the edge of a shadow from which on all of it may be one."""
 STEP_PX, END_PX = 14.0, 4.0
 """Points along an edge, and how far beyond a segment's end one may lie."""
 
@@ -68,13 +70,14 @@ def edge_tracks(video: Video, pictures: Pictures) -> Tracks:
         pictures: of its frames, and what hands cover.
 
     Returns:
-        Tracks in full px; from frame to frame each goes across its edge only, and its slip is all along it.
+        Tracks in full px; from frame to frame each goes across its edge only, and its slip is all along it. None is
+        on the edge of a shadow; ``cast`` is true where most of its edge is.
     """
     import cv2
 
     T = len(video)
     every = [segments(pictures.grey[t], video.frames[t], pictures.covered[t]) for t in range(T)]
-    uv, slip, start = [np.zeros((0, T, 2))], [np.zeros((0, T, 2))], [np.zeros(0, int)]
+    uv, slip, start, of = [np.zeros((0, T, 2))], [np.zeros((0, T, 2))], [np.zeros(0, int)], [np.zeros(0, int)]
     for chain in followed(every):
         if len(chain) < LIFE:
             continue
@@ -84,12 +87,15 @@ def edge_tracks(video: Video, pictures: Pictures) -> Tracks:
             uv.append(places[lasts])
             slip.append(along[lasts])
             start.append(np.full(int(lasts.sum()), frame))
+            of.append(np.full(int(lasts.sum()), len(of)))
     places = np.concatenate(uv).astype(np.float32)
     shade, cast = shadows(video, places, pictures.covered)
     tracks = Tracks(video.to_full(places).astype(np.float32), np.isfinite(places[..., 0]), np.concatenate(start),
                     ProviderInfo("edges", cv2.__version__, "Apache-2.0"), np.concatenate(slip).astype(np.float32),
                     shade, cast)  # fmt: skip
-    return tracks.of(~cast)
+    edge = np.concatenate(of)
+    shadow = np.bincount(edge, cast) >= MOSTLY * np.bincount(edge)
+    return replace(tracks, cast=shadow[edge]).of(~cast)
 
 
 def segments(grey: np.ndarray, colour: np.ndarray, covered: np.ndarray) -> Segments:
