@@ -328,6 +328,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.edges import unless_one_edge
     from reconstruct.joint.fit import fit_joint, moving_tracks
+    from reconstruct.joint.flat_fit import FlatFit, fit_flat
     from reconstruct.joint.handling import unless_carried
     from reconstruct.joint.rims import unless_rims_tell
     from reconstruct.joint.shadows import off_shadows, unless_a_shadow
@@ -347,6 +348,9 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
         edges = edge_tracks(video, pictures)
         return edges.of(~on_forearm(edges, hands))
 
+    def flat(points: Tracks, edges: Tracks) -> FlatFit | None:
+        return fit_flat(video, points, edges, focal)
+
     def off_shadows_too(some: Tracks) -> JointFit:
         return unless_a_shadow(ask(some), video, some, ask)
 
@@ -359,7 +363,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
         if again.verdict != "refused" and np.mean(arm[again.point_track]) < 0.5:
             return again
     fit = unless_carried(fit, video, rest, hands, off_shadows_too)
-    fit = unless_rims_tell(fit, video, rest, rims, ask)
+    fit = unless_rims_tell(fit, video, rest, rims, ask, flat)
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.answers import alone_deg
+from reconstruct.joint.flat_fit import NEAR_DEG, FlatFit
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.result import FREELY, MIN_INLIERS
@@ -23,24 +24,30 @@ from reconstruct.video import Video
 
 FACTOR = 2.0
 """How many times what is stated such joints are off (the root of the mean square of nine rendered ones, 0.1 to 3.6)."""
+PLATE_DEG, PROBABLE = 2 * VAGUE_DEG, 0.8
+"""What a plate's axis has to be known to where points show no joint, and how probable one plate has to be beside all
+others, to count though its axis is known no better."""
 SHOW_NONE = "its points alone show no joint, with its straight edges"
 LEAVE_OPEN = "its points alone leave the axis open, with its straight edges"
 
 
 def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable[[], Tracks],
-                     ask: Callable[[Tracks], JointFit]) -> JointFit:  # fmt: skip
+                     ask: Callable[[Tracks], JointFit], flat: Callable[[Tracks, Tracks], FlatFit | None]
+                     ) -> JointFit:  # fmt: skip
     """The joint, or where it is refused or its axis is open what points and straight edges together follow, doubtful
     in any case.
 
     Not where a body that is carried freely refutes it: a few edges of that follow some hinge. Where it is refused they
-    are asked without all that may be a shadow, and a sure answer counts; else without the edges of shadows, and what is
-    found counts; else what was found first. Where the axis is open, known to VAGUE_DEG or worse by points alone, they
-    are asked without the edges of shadows, and what is found counts if it is known better.
+    are asked without all that may be a shadow, and a sure answer counts; else, and where the axis is open, known to
+    VAGUE_DEG or worse by points alone, without the edges of shadows: a sure answer counts that knows it better. Else
+    the part is asked as a plate that turns in its plane, by its edges first. That counts if it knows the axis better or
+    is probable by itself. Else what was found counts, unless the most probable plate contradicts it.
 
     Args:
         fit: the joint of the points, or a refusal.
         rims: for the moving straight edges that are no shadow's and on no arm, as tracks of the same video.
         ask: for the joint of some tracks.
+        flat: for the joint of a plate, of points and of straight edges; None if they are none's.
     """
     if FREELY in fit.reason or video.warp is not None or tracks.cast is None:
         return fit
@@ -50,19 +57,34 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
     edges = rims()
     if not len(edges.uv):
         return fit
-    if not refused:
-        found = _answer(ask(_joined(without(tracks, tracks.cast), edges)), len(tracks.uv))
-        return fit if found is None or alone_deg(found) >= alone_deg(fit) else _doubtful(found, LEAVE_OPEN)
-    lit = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), len(tracks.uv))
-    if lit is not None and lit.verdict == "ok":
-        return _doubtful(lit, SHOW_NONE)
-    found = _answer(ask(_joined(without(tracks, tracks.cast), edges)), len(tracks.uv)) or lit
-    return fit if found is None else _doubtful(found, SHOW_NONE)
+    points, uncast = len(tracks.uv), without(tracks, tracks.cast)
+    words = SHOW_NONE if refused else LEAVE_OPEN
+    first = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), points) if refused else None
+    if first is not None and first.verdict == "ok":
+        return _doubtful(first, words)
+    found = _answer(ask(_joined(uncast, edges)), points) or first
+    if found is not None and found.verdict == "ok" and (refused or alone_deg(found) < alone_deg(fit)):
+        return _doubtful(found, words)
+    plate = flat(uncast, edges)
+    turned = None if plate is None else _answer(plate.fit, points)
+    better = found is not None and (refused or alone_deg(found) < alone_deg(fit))
+    if plate is not None and turned is not None:
+        known = alone_deg(turned) < (PLATE_DEG if refused else alone_deg(fit))
+        if known or plate.probability > PROBABLE:
+            return _doubtful(turned, words)
+        better = better and found is not None and _apart_deg(found, turned) < NEAR_DEG
+    return _doubtful(found, words) if found is not None and better else fit
 
 
 def _open(fit: JointFit) -> bool:
     """Whether a joint is doubtful and its axis known to VAGUE_DEG or worse by its tracks alone."""
     return fit.verdict == "ambiguous" and "axis_deg" in fit.std and alone_deg(fit) > VAGUE_DEG
+
+
+def _apart_deg(one: JointFit, other: JointFit) -> float:
+    """Angle between two axes, before one camera."""
+    a, b = (np.asarray(x.T_camera_world)[:3, :3] @ x.axis for x in (one, other))
+    return float(np.degrees(np.arccos(np.clip(abs(a @ b), 0, 1))))
 
 
 def _joined(points: Tracks, edges: Tracks) -> Tracks:

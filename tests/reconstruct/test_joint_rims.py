@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint.flat_fit import FlatFit
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.result import FREELY
 from reconstruct.joint.rims import FACTOR, unless_rims_tell
@@ -31,8 +32,9 @@ def tracks(count: int, x: float, cast: int = 0) -> Tracks:
 def joint(verdict: str, ids: np.ndarray, axis_deg: float = 4.0) -> JointFit:
     """A hinge that these tracks follow."""
     p, std = {"revolute": 0.99, "prismatic": 0.01}, {"axis_deg": axis_deg, "point_m": 0.01}
-    return JointFit(verdict, "tracks agree", "revolute", p, axis=np.array([0, 0, 1.0]), points=np.zeros((len(ids), 3)),
-                    point_track=ids, std=std, inliers=len(ids), members=ids)  # fmt: skip
+    return JointFit(verdict, "tracks agree", "revolute", p, axis=np.array([0, 0, 1.0]), T_camera_world=np.eye(4),
+                    points=np.zeros((len(ids), 3)), point_track=ids, std=std, inliers=len(ids),
+                    members=ids)  # fmt: skip
 
 
 class Asked:
@@ -50,13 +52,17 @@ def edges() -> Tracks:
     return tracks(EDGES, 30.0)
 
 
+def no_plate(points: Tracks, edges: Tracks) -> None:
+    """What edges say that are no plate's."""
+
+
 def never() -> Tracks:
     raise AssertionError("edges were followed")
 
 
 def test_what_is_carried_freely_is_not_asked_for_its_edges():
     fit = JointFit("refused", f"{FREELY}: its points follow one 3.1 times more exactly than the best joint (revolute)")
-    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked()) is fit
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked(), no_plate) is fit
 
 
 POINT_IDS, BOTH_IDS = np.arange(10, 20), np.arange(20, POINTS + EDGES)
@@ -65,12 +71,13 @@ OTHER_IDS = np.concatenate([POINT_IDS, np.arange(POINTS, POINTS + EDGES)])
 
 @pytest.mark.parametrize("fit", [joint("ambiguous", POINT_IDS), joint("ok", POINT_IDS, 20.0)])
 def test_a_joint_whose_axis_is_known_is_left_alone(fit):
-    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked()) is fit
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked(), no_plate) is fit
 
 
 def test_an_open_axis_is_taken_from_edges_that_know_it_better():
     ask = Asked(joint("ok", OTHER_IDS, 6.0))
-    out = unless_rims_tell(joint("ambiguous", BOTH_IDS, 20.0), VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
+    fit, some = joint("ambiguous", BOTH_IDS, 20.0), tracks(POINTS, 20.0, cast=5)
+    out = unless_rims_tell(fit, VIDEO, some, edges, ask, no_plate)
     assert out.verdict == "ambiguous" and "leave the axis open" in out.reason
     assert out.std["axis_deg"] == FACTOR * 6.0 and np.array_equal(out.members, POINT_IDS)
     assert np.array_equal(ask.of[0].visible.any(1), np.arange(POINTS + EDGES) >= 5)
@@ -83,19 +90,19 @@ def test_an_open_axis_is_taken_from_edges_that_know_it_better():
 ])  # fmt: skip
 def test_an_open_axis_stays_where_edges_know_it_no_better(found):
     fit = joint("ambiguous", BOTH_IDS, 20.0)
-    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(found)) is fit
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(found), no_plate) is fit
 
 
 @pytest.mark.parametrize("why", ["a hand holds the camera", "nothing is known of shadows"])
 def test_edges_are_not_followed_where_they_say_nothing(why):
     video = replace(VIDEO, warp=np.tile(np.eye(3), (T, 1, 1))) if why.startswith("a hand") else VIDEO
     some = tracks(POINTS, 20.0) if why.startswith("a hand") else replace(tracks(POINTS, 20.0), cast=None)
-    assert unless_rims_tell(REFUSED, video, some, never, Asked()) is REFUSED
+    assert unless_rims_tell(REFUSED, video, some, never, Asked(), no_plate) is REFUSED
 
 
 def test_a_sure_answer_without_all_shadows_counts_but_is_doubtful():
     ask = Asked(joint("ok", BOTH_IDS))
-    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask, no_plate)
     assert out.verdict == "ambiguous"
     assert "straight edges" in out.reason
     assert out.std["axis_deg"] == FACTOR * 4.0
@@ -107,7 +114,7 @@ def test_a_sure_answer_without_all_shadows_counts_but_is_doubtful():
 
 
 def test_its_points_are_those_of_points():
-    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(joint("ok", BOTH_IDS)))
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(joint("ok", BOTH_IDS)), no_plate)
     assert np.array_equal(out.point_track, np.arange(20, POINTS))
     assert len(out.points) == POINTS - 20
     assert out.tracks == POINTS
@@ -116,24 +123,57 @@ def test_its_points_are_those_of_points():
 def test_what_is_only_off_shadows_edges_is_asked_second():
     doubtful, other = joint("ambiguous", BOTH_IDS), joint("ambiguous", OTHER_IDS)
     ask = Asked(doubtful, other)
-    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask)
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, ask, no_plate)
     assert np.array_equal(out.point_track, POINT_IDS)
     assert np.array_equal(out.members, POINT_IDS)
     assert np.array_equal(ask.of[1].visible[:POINTS].any(1), np.arange(POINTS) >= 5)
-    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, Asked(doubtful, REFUSED))
+    out = unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0, cast=5), edges, Asked(doubtful, REFUSED), no_plate)
     assert np.array_equal(out.point_track, np.arange(20, POINTS))
 
 
 def test_what_edges_alone_follow_is_no_joint_of_a_part():
     alone = joint("ok", np.arange(POINTS - 3, POINTS + EDGES))
-    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone)) is REFUSED
+    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone), no_plate) is REFUSED
 
 
 def test_what_points_alone_follow_stays_refused():
     alone = joint("ok", np.arange(10, POINTS + 3))
-    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone)) is REFUSED
+    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), edges, Asked(alone, alone), no_plate) is REFUSED
 
 
 def test_without_edges_nothing_is_asked():
     none = lambda: tracks(0, 0.0)  # noqa: E731
-    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), none, Asked()) is REFUSED
+    assert unless_rims_tell(REFUSED, VIDEO, tracks(POINTS, 20.0), none, Asked(), no_plate) is REFUSED
+
+
+@pytest.mark.parametrize(("fit", "axis_deg", "probability"), [
+    (joint("ambiguous", BOTH_IDS, 20.0), 15.0, 0.5),
+    (joint("ambiguous", BOTH_IDS, 20.0), 30.0, 0.9),
+    (REFUSED, 15.0, 0.5),
+])  # fmt: skip
+def test_a_plate_counts_that_is_known_better_or_is_probable_by_itself(fit, axis_deg, probability):
+    plate = FlatFit(joint("ok", OTHER_IDS, axis_deg), probability)
+    ask = Asked(*[joint("ambiguous", BOTH_IDS, 12.0)] * 2)
+    out = unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, ask, lambda points, rims: plate)
+    assert out.verdict == "ambiguous"
+    assert out.std["axis_deg"] == FACTOR * axis_deg
+    assert np.array_equal(out.members, POINT_IDS)
+
+
+@pytest.mark.parametrize("agrees", [True, False])
+def test_what_the_likeliest_plate_contradicts_does_not_count(agrees):
+    found, fit = joint("ambiguous", OTHER_IDS, 12.0), joint("ambiguous", BOTH_IDS, 20.0)
+    other = joint("ok", OTHER_IDS, 30.0)
+    plate = FlatFit(other if agrees else replace(other, axis=np.array([1.0, 0, 0])), 0.5)
+    out = unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(found), lambda points, rims: plate)
+    assert (out is fit) != agrees
+    assert not agrees or out.std["axis_deg"] == FACTOR * 12.0
+
+
+def test_a_sure_joint_of_edges_counts_before_a_plate():
+    def never_flat(points: Tracks, rims: Tracks) -> None:
+        raise AssertionError("a plate was asked for")
+
+    ask = Asked(joint("ok", OTHER_IDS, 6.0))
+    out = unless_rims_tell(joint("ambiguous", BOTH_IDS, 20.0), VIDEO, tracks(POINTS, 20.0), edges, ask, never_flat)
+    assert out.std["axis_deg"] == FACTOR * 6.0
