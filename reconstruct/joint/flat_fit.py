@@ -35,10 +35,12 @@ PLATE = {"revolute": 0.95, "prismatic": 0.05}
 
 @dataclass(frozen=True)
 class FlatFit:
-    """fit: the joint.  probability: that the axis is within NEAR_DEG of it rather than one of the other plates'."""
+    """fit: the joint.  probability: that the axis is within NEAR_DEG of it rather than one of the other plates'.
+    share: of the motion of all edges what it explains."""
 
     fit: JointFit
     probability: float
+    share: float
 
 
 def fit_flat(video: Video, points: Tracks, edges: Tracks, focal_px: float | None = None) -> FlatFit | None:
@@ -100,7 +102,7 @@ def fit_flat(video: Video, points: Tracks, edges: Tracks, focal_px: float | None
     done = Finished(b, sight, np.concatenate([best.ids, N + best.rows]), sure, PLATE, view)
     note = "; the link is taken as a plate that turns in its plane"
     fit = result_of(video, done, full, N + len(on_edges), note, KNOWN_STD if known else None)
-    return FlatFit(fit, float(p[apart < NEAR_DEG].sum()))
+    return FlatFit(fit, float(p[apart < NEAR_DEG].sum()), plate.share)
 
 
 @dataclass(frozen=True)

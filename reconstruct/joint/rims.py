@@ -27,6 +27,10 @@ FACTOR = 2.0
 PLATE_DEG, PROBABLE = 2 * VAGUE_DEG, 0.8
 """What a plate's axis has to be known to where points show no joint, and how probable one plate has to be beside all
 others, to count though its axis is known no better."""
+NEARLY_ALL = 0.8
+"""Of the motion of all edges what a plate has to explain to count against a doubtful joint whose axis is known: of 49
+films of other parts one does, a blade of three edges, of small scissors about half."""
+DOUBTFUL = "its points alone leave the joint in doubt, with its straight edges"
 SHOW_NONE = "its points alone show no joint, with its straight edges"
 LEAVE_OPEN = "its points alone leave the axis open, with its straight edges"
 
@@ -41,7 +45,8 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
     are asked without all that may be a shadow, and a sure answer counts; else, and where the axis is open, known to
     VAGUE_DEG or worse by points alone, without the edges of shadows: a sure answer counts that knows it better. Else
     the part is asked as a plate that turns in its plane, by its edges first. That counts if it knows the axis better or
-    is probable by itself. Else what was found counts, unless the most probable plate contradicts it.
+    is probable by itself. Else what was found counts, unless the most probable plate contradicts it. Where a joint is
+    doubtful though its axis is known, a plate counts that contradicts it, is probable, and explains nearly all edges.
 
     Args:
         fit: the joint of the points, or a refusal.
@@ -52,12 +57,14 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
     if FREELY in fit.reason or video.warp is not None or tracks.cast is None:
         return fit
     refused = fit.verdict == "refused"
-    if not refused and not _open(fit):
+    if fit.verdict == "ok":
         return fit
     edges = rims()
     if not len(edges.uv):
         return fit
     points, uncast = len(tracks.uv), without(tracks, tracks.cast)
+    if not refused and not _open(fit):
+        return _unless_plainly_a_plate(fit, flat(uncast, edges), points)
     words = SHOW_NONE if refused else LEAVE_OPEN
     first = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), points) if refused else None
     if first is not None and first.verdict == "ok":
@@ -74,6 +81,16 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
             return _doubtful(turned, words)
         better = better and found is not None and _apart_deg(found, turned) < NEAR_DEG
     return _doubtful(found, words) if found is not None and better else fit
+
+
+def _unless_plainly_a_plate(fit: JointFit, plate: FlatFit | None, points: int) -> JointFit:
+    """A doubtful joint, or the plate that contradicts it and explains nearly all edges."""
+    turned = None if plate is None else _answer(plate.fit, points)
+    if plate is None or turned is None or plate.probability <= PROBABLE or plate.share < NEARLY_ALL:
+        return fit
+    if fit.axis is not None and fit.type == turned.type and _apart_deg(fit, turned) < NEAR_DEG:
+        return fit
+    return _doubtful(turned, DOUBTFUL)
 
 
 def _open(fit: JointFit) -> bool:

@@ -69,8 +69,8 @@ POINT_IDS, BOTH_IDS = np.arange(10, 20), np.arange(20, POINTS + EDGES)
 OTHER_IDS = np.concatenate([POINT_IDS, np.arange(POINTS, POINTS + EDGES)])
 
 
-@pytest.mark.parametrize("fit", [joint("ambiguous", POINT_IDS), joint("ok", POINT_IDS, 20.0)])
-def test_a_joint_whose_axis_is_known_is_left_alone(fit):
+def test_a_sure_joint_is_left_alone():
+    fit = joint("ok", POINT_IDS, 20.0)
     assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), never, Asked(), no_plate) is fit
 
 
@@ -152,7 +152,7 @@ def test_without_edges_nothing_is_asked():
     (REFUSED, 15.0, 0.5),
 ])  # fmt: skip
 def test_a_plate_counts_that_is_known_better_or_is_probable_by_itself(fit, axis_deg, probability):
-    plate = FlatFit(joint("ok", OTHER_IDS, axis_deg), probability)
+    plate = FlatFit(joint("ok", OTHER_IDS, axis_deg), probability, 0.7)
     ask = Asked(*[joint("ambiguous", BOTH_IDS, 12.0)] * 2)
     out = unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, ask, lambda points, rims: plate)
     assert out.verdict == "ambiguous"
@@ -164,7 +164,7 @@ def test_a_plate_counts_that_is_known_better_or_is_probable_by_itself(fit, axis_
 def test_what_the_likeliest_plate_contradicts_does_not_count(agrees):
     found, fit = joint("ambiguous", OTHER_IDS, 12.0), joint("ambiguous", BOTH_IDS, 20.0)
     other = joint("ok", OTHER_IDS, 30.0)
-    plate = FlatFit(other if agrees else replace(other, axis=np.array([1.0, 0, 0])), 0.5)
+    plate = FlatFit(other if agrees else replace(other, axis=np.array([1.0, 0, 0])), 0.5, 0.7)
     out = unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(found), lambda points, rims: plate)
     assert (out is fit) != agrees
     assert not agrees or out.std["axis_deg"] == FACTOR * 12.0
@@ -177,3 +177,22 @@ def test_a_sure_joint_of_edges_counts_before_a_plate():
     ask = Asked(joint("ok", OTHER_IDS, 6.0))
     out = unless_rims_tell(joint("ambiguous", BOTH_IDS, 20.0), VIDEO, tracks(POINTS, 20.0), edges, ask, never_flat)
     assert out.std["axis_deg"] == FACTOR * 6.0
+
+
+@pytest.mark.parametrize(("probability", "share", "agrees", "counts"), [
+    (0.9, 0.9, False, True),
+    (0.7, 0.9, False, False),
+    (0.9, 0.7, False, False),
+    (0.9, 0.9, True, False),
+])  # fmt: skip
+def test_a_doubtful_joint_gives_way_to_a_plate_that_nearly_all_edges_follow(probability, share, agrees, counts):
+    fit, other = joint("ambiguous", BOTH_IDS, 4.0), joint("ok", OTHER_IDS, 8.0)
+    plate = FlatFit(other if agrees else replace(other, axis=np.array([1.0, 0, 0])), probability, share)
+    out = unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(), lambda points, rims: plate)
+    assert (out is not fit) == counts
+    assert not counts or (out.verdict == "ambiguous" and out.std["axis_deg"] == FACTOR * 8.0)
+
+
+def test_a_doubtful_joint_stays_where_edges_are_no_plates():
+    fit = joint("ambiguous", BOTH_IDS, 4.0)
+    assert unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, Asked(), no_plate) is fit
