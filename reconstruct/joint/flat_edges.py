@@ -4,7 +4,8 @@ How a straight edge goes is seen across itself only, and by how it turns: two nu
 about one point of it, all edges turn by one angle, which their pictures do not (a circle is foreshortened), and keep
 their distances from that point. For a plane that is given, the angles of all edges give the turn, and distances that
 are kept give the point, by linear equations: so all planes are tried, each by one edge's turn at a time, and what other
-edges follow it counts. What is near its best is summed up, with where axes are likely, to what is stated.
+edges follow it counts. Where axes are likely, and how far people open things, counts too: planes seen nearly on edge
+explain a small motion by next to no turn.
 """
 
 from __future__ import annotations

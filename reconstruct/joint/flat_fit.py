@@ -72,6 +72,8 @@ def fit_flat(video: Video, points: Tracks, edges: Tracks, focal_px: float | None
     lasting = max(len(frames) / LOOKS, 1.0)
     tried = []
     for plate in plates_of(lines, view.focal):
+        if plate.follows.sum() < FEWEST:
+            continue
         rows = np.flatnonzero(plate.follows[of])
         like = replace(view.sightings(on_edges[rows], frames, lasting), flat=FLAT, along=plate.normal)
         b = polish(_bundle(plate, on_edges[rows], edges.reference[rows], view.focal), like, 20)
@@ -84,9 +86,7 @@ def fit_flat(video: Video, points: Tracks, edges: Tracks, focal_px: float | None
     p = np.exp(weight - logsumexp(weight))
     best = tried[int(np.argmax(p))]
     plate = best.plate
-    if plate.share < SHARE or plate.follows.sum() < FEWEST or np.ptp(plate.q) < np.radians(LEAST_DEG):
-        return None
-    if len(best.ids) < MIN_INLIERS:
+    if plate.share < SHARE or np.ptp(plate.q) < np.radians(LEAST_DEG) or len(best.ids) < MIN_INLIERS:
         return None
     apart = np.array([_apart_deg(plate.normal, t.plate.normal) for t in tried])
     axis_deg = float(np.sqrt(np.sum(p * (np.array([t.plate.std_deg for t in tried]) ** 2 + apart**2))))
@@ -107,7 +107,12 @@ def fit_flat(video: Video, points: Tracks, edges: Tracks, focal_px: float | None
 
 @dataclass(frozen=True)
 class _Tried:
-    """A plate, the edges' tracks that follow it, its joint by these, and the points that follow too, and where."""
+    """A plate that edges follow.
+
+    Attributes:
+        rows: (m,) the edges' tracks that do.  bundle: its joint by these.
+        ids: (k,) points that follow it too.  X: (k, 3) where these are.
+    """
 
     plate: EdgePlate
     rows: np.ndarray
