@@ -323,7 +323,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     mostly an arm's counts. Shadows go nearly as the part goes too. What may be the edge of one is left out where enough
     else moves, and asked where nothing is found without it. What one straight edge alone follows is no sure joint.
     Where a body refutes it that is carried freely, what the hands carry is left out. Where nothing is found at all,
-    or the axis stays open, the part's straight edges are followed and asked too.
+    or the joint stays in doubt, the part's straight edges are followed and asked too.
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.edges import unless_one_edge

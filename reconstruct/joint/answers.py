@@ -22,9 +22,13 @@ def contradicts(one: JointFit, other: JointFit) -> bool:
         return True
     if one.axis is None or other.axis is None or one.std is None or other.std is None:
         return False
-    axes = [x.axis @ x.T_camera_world[:3, :3].T for x in (one, other)]
-    apart = np.degrees(np.arccos(min(1.0, abs(float(axes[0] @ axes[1])))))
-    return bool(apart > APART_STDS * np.hypot(alone_deg(one), alone_deg(other)))
+    return bool(apart_deg(one, other) > APART_STDS * np.hypot(alone_deg(one), alone_deg(other)))
+
+
+def apart_deg(one: JointFit, other: JointFit) -> float:
+    """Angle between the axes of two joints before one camera, 0 to 90 deg."""
+    a, b = (np.asarray(x.T_camera_world)[:3, :3] @ x.axis for x in (one, other))
+    return float(np.degrees(np.arccos(min(1.0, abs(float(a @ b))))))
 
 
 def better_known(joint: JointFit, than: JointFit) -> JointFit | None:

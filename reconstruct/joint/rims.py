@@ -1,4 +1,4 @@
-"""A part whose points show no joint, or leave its axis open, asked again with its straight edges.
+"""A part whose points show no joint, or leave it in doubt, asked again with its straight edges.
 
 Parts of even paint, and small ones, have few points, which are lost within a few frames, and shadows have many: what is
 left when those are taken away follows nothing, and the joint is refused. The straight edges that move and are no
@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.answers import alone_deg
+from reconstruct.joint.answers import alone_deg, apart_deg
 from reconstruct.joint.flat_fit import NEAR_DEG, FlatFit
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import VAGUE_DEG, JointFit
@@ -38,8 +38,8 @@ LEAVE_OPEN = "its points alone leave the axis open, with its straight edges"
 def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable[[], Tracks],
                      ask: Callable[[Tracks], JointFit], flat: Callable[[Tracks, Tracks], FlatFit | None]
                      ) -> JointFit:  # fmt: skip
-    """The joint, or where it is refused or its axis is open what points and straight edges together follow, doubtful
-    in any case.
+    """The joint, or where it is refused or doubtful what points and straight edges together follow, doubtful in any
+    case.
 
     Not where a body that is carried freely refutes it: a few edges of that follow some hinge. Where it is refused they
     are asked without all that may be a shadow, and a sure answer counts; else, and where the axis is open, known to
@@ -79,7 +79,7 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
         known = alone_deg(turned) < (PLATE_DEG if refused else alone_deg(fit))
         if known or plate.probability > PROBABLE:
             return _doubtful(turned, words)
-        better = better and found is not None and _apart_deg(found, turned) < NEAR_DEG
+        better = better and found is not None and apart_deg(found, turned) < NEAR_DEG
     return _doubtful(found, words) if found is not None and better else fit
 
 
@@ -88,7 +88,7 @@ def _unless_plainly_a_plate(fit: JointFit, plate: FlatFit | None, points: int) -
     turned = None if plate is None else _answer(plate.fit, points)
     if plate is None or turned is None or plate.probability <= PROBABLE or plate.share < NEARLY_ALL:
         return fit
-    if fit.axis is not None and fit.type == turned.type and _apart_deg(fit, turned) < NEAR_DEG:
+    if fit.axis is not None and fit.type == turned.type and apart_deg(fit, turned) < NEAR_DEG:
         return fit
     return _doubtful(turned, DOUBTFUL)
 
@@ -96,12 +96,6 @@ def _unless_plainly_a_plate(fit: JointFit, plate: FlatFit | None, points: int) -
 def _open(fit: JointFit) -> bool:
     """Whether a joint is doubtful and its axis known to VAGUE_DEG or worse by its tracks alone."""
     return fit.verdict == "ambiguous" and "axis_deg" in fit.std and alone_deg(fit) > VAGUE_DEG
-
-
-def _apart_deg(one: JointFit, other: JointFit) -> float:
-    """Angle between two axes, before one camera."""
-    a, b = (np.asarray(x.T_camera_world)[:3, :3] @ x.axis for x in (one, other))
-    return float(np.degrees(np.arccos(np.clip(abs(a @ b), 0, 1))))
 
 
 def _joined(points: Tracks, edges: Tracks) -> Tracks:
