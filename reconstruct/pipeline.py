@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
 ARM_SHARE = 0.2
 """Where no joint is found and this share of what moves stays on a forearm, it is sought without the arms' tracks."""
+TRACKING = tuple(f"providers/{n}.py" for n in ("lk_tracks", "affine", "seeds", "shade"))
+"""Source files that follow points."""
+JOINT = ("joint", "depth.py", "hand/carried.py", "hand/forearm.py", "providers/edge_tracks.py", "providers/shade.py")
+"""Source files that find the joint."""
 
 
 class Progress(Protocol):
@@ -300,11 +304,10 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
     if folder and scene is not None:
         folder = cues_io.CueFolder(scene, stages.chosen)
         given = folder.given()
-    tracks = stages.run("tracks", follow, tuple(f"providers/{n}.py" for n in ("lk_tracks", "affine", "seeds", "shade")),
-                        given=given.get("tracks"))  # fmt: skip
+    tracks = stages.run("tracks", follow, TRACKING, given=given.get("tracks"))
+    tracks, fit, words, unit = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
     if folder:
         folder.write("tracks", cues_io.track_arrays(tracks))
-    fit, words, unit = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
     if folder and fit.verdict != "refused":
         folder.write("camera", cues_io.camera_arrays(fit, len(stable)))
     makers = dict.fromkeys([hands.provider, tracks.provider])
@@ -315,7 +318,7 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
 
 
 def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float | None, seed: int,
-                      progress: Callable[[float], None]) -> JointFit:  # fmt: skip
+                      progress: Callable[[float], None], margin_px: int | None = None) -> JointFit:  # fmt: skip
     """The joint without depth, from the tracks that are on no forearm and on no shadow's edge.
 
     Sleeves often have more tracks than the part, and go nearly as it goes. Where nothing is found without them and
@@ -324,6 +327,9 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     else moves, and asked where nothing is found without it. What one straight edge alone follows is no sure joint.
     Where a body refutes it that is carried freely, what the hands carry is left out. Where nothing is found at all,
     or the joint stays in doubt, the part's straight edges are followed and asked too.
+
+    Args:
+        margin_px: how far off hands pictures are looked at, as of :func:`lk_tracks.pictures_of`; as usual when None.
     """
     from reconstruct.hand.forearm import on_forearm
     from reconstruct.joint.edges import unless_one_edge
@@ -333,9 +339,9 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     from reconstruct.joint.rims import unless_rims_tell
     from reconstruct.joint.shadows import off_shadows, unless_a_shadow
     from reconstruct.providers.edge_tracks import edge_tracks
-    from reconstruct.providers.lk_tracks import pictures_of
+    from reconstruct.providers.lk_tracks import MARGIN_PX, pictures_of
 
-    pictures = pictures_of(video, hands)
+    pictures = pictures_of(video, hands, MARGIN_PX if margin_px is None else margin_px)
     arm = on_forearm(tracks, hands)
     share = float(np.mean(arm[moving])) if len(moving := moving_tracks(video, tracks)) else 0.0
     rest = replace(tracks, visible=tracks.visible & ~arm[:, None]) if share > 0 else tracks
@@ -370,9 +376,10 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,
            folder: cues_io.CueFolder | None, given: Mapping[str, str], seed: int,
-           stages: Stages) -> tuple[JointFit, list[str], float]:  # fmt: skip
-    """The joint, metric where a scale is known, in the world of the user's camera where there is one; notes; and the
-    length of that world's unit in the joint's."""
+           stages: Stages) -> tuple[Tracks, JointFit, list[str], float]:  # fmt: skip
+    """The tracks that it is a joint of: those given, or some up to the hands' rims; the joint, metric where a scale is
+    known, in the world of the user's camera where there is one; notes; and the length of that world's unit in the
+    joint's."""
     from reconstruct.depth import depth_scale
     from reconstruct.hand.scale import hand_scale
     from reconstruct.joint.rigid.cues import fit_from_cues
@@ -400,15 +407,15 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         return fit_from_cues(tracks, camera, depth, tracks_cue.get("xyz_world"), moving, video.size, metric, seed)
 
     with_depth = {key: given.get(key) for key in ("depth", "camera", "masks")} if ranged else None
-    parts = ("joint", "depth.py", "hand/carried.py", "hand/forearm.py", "providers/edge_tracks.py",
-             "providers/shade.py")  # fmt: skip
-    fit: JointFit = stages.run("joint", find, parts, options={"focal": focal, "with_depth": with_depth})
+    fit: JointFit = stages.run("joint", find, JOINT, options={"focal": focal, "with_depth": with_depth})
     if ranged and fit.verdict == "refused":
         notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")
         ranged = False
-        fit = stages.run("joint", find, parts, options={"focal": focal, "with_depth": None})
+        fit = stages.run("joint", find, JOINT, options={"focal": focal, "with_depth": None})
+    if not ranged and "tracks" not in given:
+        tracks, fit = _up_to_hands(fit, video, tracks, hands, focal, seed, stages)
     if fit.verdict == "refused":
-        return fit, notes, 1.0
+        return tracks, fit, notes, 1.0
     plain = fit
 
     def scaled() -> JointFit:
@@ -434,7 +441,33 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
     fit = alongside(fit, plain)
     # A scene without metres whose joint the hand has scaled: what else it holds, meshes, is scaled alike.
     lengths = [np.median(np.linalg.norm(f.points, axis=1)) for f in (plain, fit)]
-    return fit, notes, float(lengths[1] / lengths[0]) if ranged else 1.0
+    return tracks, fit, notes, float(lengths[1] / lengths[0]) if ranged else 1.0
+
+
+def _up_to_hands(fit: JointFit, video: Video, tracks: Tracks, hands: Hands, focal: float | None, seed: int,
+                 stages: Stages) -> tuple[Tracks, JointFit]:  # fmt: skip
+    """The tracks and their joint, or those up to the hands' rims and theirs."""
+    from reconstruct.joint.closer import unless_hands_hide_it
+    from reconstruct.providers.lk_tracks import CLOSE_PX, track_points
+
+    def follow() -> Tracks:
+        made: Tracks = stages.run(
+            "tracks-closer",
+            lambda: track_points(video, hands, progress=stages.progress.update, margin_px=CLOSE_PX),
+            TRACKING,
+        )
+        return made
+
+    def ask(some: Tracks) -> JointFit:
+        made: JointFit = stages.run(
+            "joint-closer",
+            lambda: joint_off_the_arm(video, some, hands, focal, seed, stages.progress.update, CLOSE_PX),
+            JOINT,
+            options={"focal": focal},
+        )
+        return made
+
+    return unless_hands_hide_it(fit, video, tracks, hands, follow, ask)
 
 
 def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int, seen: Seen,

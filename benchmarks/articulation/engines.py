@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.articulation.bound import Bound
 from benchmarks.articulation.motions import SIZE, pixel_rays
 from benchmarks.articulation.noise import Given
-from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.cues import Hands, ProviderInfo, Tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
@@ -48,7 +48,10 @@ def solve(given: Given, best: Bound | None, focal_known: bool = True, seed: int 
     pipeline does, which knows where the arms are."""
     begin = time.perf_counter()
     try:
-        fit = _with_depth(given, seed) if given.depth is not None else _without_depth(given, focal_known, seed)
+        if given.depth is not None:
+            fit = _with_depth(given, seed)
+        else:
+            given, fit = _without_depth(given, focal_known, seed)
     except Exception as error:  # whatever goes wrong is a failed case, not the end of the table
         return Answer("failed", f"{type(error).__name__}: {error}", seconds=time.perf_counter() - begin)
     seconds = time.perf_counter() - begin
@@ -86,21 +89,37 @@ def _with_depth(given: Given, seed: int) -> JointFit:
     return fit_rigid(given.uv, given.visible, given.depth, shot.K, shot.T_world_camera, given.link, seed=seed)
 
 
-def _without_depth(given: Given, focal_known: bool, seed: int) -> JointFit:
+def _without_depth(given: Given, focal_known: bool, seed: int) -> tuple[Given, JointFit]:
+    """The joint, and the tracks that it is one of: of a clip maybe others than those given."""
     from reconstruct.joint.fit import fit_joint
-    from reconstruct.pipeline import joint_off_the_arm
 
-    T = given.uv.shape[1]
-    frames = given.frames
-    if frames is None:
-        frames = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
-    video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, frames, 1.0)
     tracks = Tracks(given.uv.astype(np.float32), given.visible, given.scene.seed, PROVIDER, given.slip, given.shade,
                     given.cast)  # fmt: skip
     focal = float(given.scene.shot.K[0, 0]) if focal_known else None
-    if given.hands is not None:
-        return joint_off_the_arm(video, tracks, given.hands, focal, seed, lambda _: None)
-    return fit_joint(video, tracks, focal, seed)
+    if given.hands is not None and given.frames is not None:
+        return _of_pixels(given, given.hands, given.frames, tracks, focal, seed)
+    T = given.uv.shape[1]
+    frames = np.broadcast_to(np.zeros((1, 1, 1, 3), np.uint8), (T, SIZE[1], SIZE[0], 3))
+    video = Video(Path("none.mp4"), "0" * 64, SIZE, np.arange(T) / 30, np.arange(T), T, frames, 1.0)
+    return given, fit_joint(video, tracks, focal, seed)
+
+
+def _of_pixels(given: Given, hands: Hands, frames: np.ndarray, tracks: Tracks, focal: float | None, seed: int
+               ) -> tuple[Given, JointFit]:  # fmt: skip
+    """As the pipeline does."""
+    from benchmarks.articulation.pixels import video_of, with_tracks
+    from reconstruct.joint.closer import unless_hands_hide_it
+    from reconstruct.pipeline import joint_off_the_arm
+    from reconstruct.providers.lk_tracks import CLOSE_PX, track_points
+
+    video = video_of(frames)
+
+    def ask(some: Tracks, margin_px: int | None = None) -> JointFit:
+        return joint_off_the_arm(video, some, hands, focal, seed, lambda _: None, margin_px)
+
+    used, fit = unless_hands_hide_it(ask(tracks), video, tracks, hands, lambda: track_points(video, hands,
+                                     margin_px=CLOSE_PX), lambda some: ask(some, CLOSE_PX))  # fmt: skip
+    return given if used is tracks else with_tracks(given, used), fit
 
 
 def _registration(fit: JointFit, given: Given, best: Bound | None) -> tuple[float, np.ndarray] | None:

@@ -18,6 +18,8 @@ from benchmarks.articulation.motions import FOCAL, SIZE, Shot, pixel_rays, shoot
 from benchmarks.articulation.noise import Given
 from benchmarks.articulation.objects import Model
 from benchmarks.articulation.scenes import Hidden, Scene, project, rng_of
+from reconstruct.cues import Tracks
+from reconstruct.video import Video
 
 if TYPE_CHECKING:
     from reconstruct.synth.hand_model import HandPose
@@ -45,19 +47,33 @@ def film(model: Model, motion: str, texture: str, small: bool = False, seed: int
     """
     from reconstruct.providers.lk_tracks import track_points
     from reconstruct.providers.mediapipe_hand import detect_hands
-    from reconstruct.video import Video
 
     rng = rng_of(seed, model.name, motion, texture, "small" if small else "full")
     shot = shoot(model, motion, False, small, frames, rng)
     images = pictures(model, shot, texture, rng)
-    video = Video(Path("rendered.mp4"), "0" * 64, SIZE, np.arange(frames) / 24, np.arange(frames), frames,
-                  np.ascontiguousarray(images[..., ::-1]), 1.0)  # fmt: skip
+    video = video_of(np.ascontiguousarray(images[..., ::-1]))
     hands = detect_hands(video)
     tracks = track_points(video, hands)
     if not len(tracks.uv):
         raise Hidden(f"{model.name}: nothing was tracked")
     known = _known(model, motion, small, shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+    if (count := int(known.scene.moving.sum())) < 8:
+        raise Hidden(f"{model.name}: {count} tracks were seeded on the moving link")
     return replace(known, hands=hands, slip=tracks.slip, shade=tracks.shade, cast=tracks.cast, frames=video.frames)
+
+
+def video_of(frames: np.ndarray) -> Video:
+    """A rendered clip's frames (T, h, w, 3) uint8 BGR as a video."""
+    T = len(frames)
+    return Video(Path("rendered.mp4"), "0" * 64, SIZE, np.arange(T) / 24, np.arange(T), T, frames, 1.0)
+
+
+def with_tracks(given: Given, tracks: Tracks) -> Given:
+    """The clip by other tracks of its pixels."""
+    s = given.scene
+    known = _known(s.model, s.motion, s.small, s.shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+    return replace(given, scene=known.scene, uv=known.uv, visible=known.visible, wrong=known.wrong, slip=tracks.slip,
+                   shade=tracks.shade, cast=tracks.cast)  # fmt: skip
 
 
 def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, visible: np.ndarray,
@@ -76,8 +92,6 @@ def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, v
         back = model.link_pose(float(shot.q[0]), float(shot.q[f]))
         world[on] = world[on] @ back[:3, :3].T + back[:3, 3]
         points[rows], moving[rows] = world, on
-    if moving.sum() < 8:
-        raise Hidden(f"{model.name}: {int(moving.sum())} tracks were seeded on the moving link")
     world = np.repeat(points[:, None], T, axis=1)
     poses = model.link_pose(shot.q, float(shot.q[0]))
     world[moving] = np.einsum("tij,nj->nti", poses[:, :3, :3], points[moving]) + poses[:, :3, 3]

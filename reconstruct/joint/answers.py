@@ -6,12 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.joint.models import JointFit
+from reconstruct.joint.kinds import or_by_prior
+from reconstruct.joint.models import VAGUE_DEG, JointFit
 
 APART_STDS = 2.0
 """Standard deviations of their axes by which two joints contradict each other."""
 AS_WELL = 1.5
 """Ratio of what two joints state of their axes up to which these are known alike."""
+FACTOR = 2.0
+"""How many times what is stated joints are off that are taken for want of a better one (the root of the mean square of
+nine rendered ones by straight edges, 0.1 to 3.6; of four by points up to the hands' rims, 0.5 to 3.1)."""
 
 
 def contradicts(one: JointFit, other: JointFit) -> bool:
@@ -45,3 +49,17 @@ def alone_deg(fit: JointFit) -> float:
     """Standard deviation of an axis by its own tracks: that some direction of the picture's edges fits a joint does not
     make it the right one of two."""
     return fit.std["axis_deg"] if fit.alone_deg is None else fit.alone_deg
+
+
+def is_open(fit: JointFit) -> bool:
+    """Whether a joint is doubtful and its axis known to VAGUE_DEG or worse by its tracks alone."""
+    return fit.verdict == "ambiguous" and "axis_deg" in fit.std and alone_deg(fit) > VAGUE_DEG
+
+
+def doubtful(fit: JointFit, words: str) -> JointFit:
+    """The joint as `ambiguous`: its type half by the prior, its axis and place FACTOR times less sure."""
+    p, std = or_by_prior(fit.type_probability), dict(fit.std)
+    for k in ("axis_deg", "point_m"):
+        if k in std:
+            std[k] = FACTOR * std[k]
+    return replace(fit, verdict="ambiguous", reason=f"{words}, {fit.reason}", type_probability=p, std=std)

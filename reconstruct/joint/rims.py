@@ -14,16 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.answers import alone_deg, apart_deg
+from reconstruct.joint.answers import alone_deg, apart_deg, doubtful, is_open
 from reconstruct.joint.flat_fit import NEAR_DEG, FlatFit
-from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.result import FREELY, MIN_INLIERS
 from reconstruct.joint.shadows import maybe_shadows, without
 from reconstruct.video import Video
 
-FACTOR = 2.0
-"""How many times what is stated such joints are off (the root of the mean square of nine rendered ones, 0.1 to 3.6)."""
 PLATE_DEG, PROBABLE = 2 * VAGUE_DEG, 0.8
 """What a plate's axis has to be known to where points show no joint, and how probable one plate has to be beside all
 others, to count though its axis is known no better."""
@@ -63,24 +60,24 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
     if not len(edges.uv):
         return fit
     points, uncast = len(tracks.uv), without(tracks, tracks.cast)
-    if not refused and not _open(fit):
+    if not refused and not is_open(fit):
         return _unless_plainly_a_plate(fit, flat(uncast, edges), points)
     words = SHOW_NONE if refused else LEAVE_OPEN
     first = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), points) if refused else None
     if first is not None and first.verdict == "ok":
-        return _doubtful(first, words)
+        return doubtful(first, words)
     found = _answer(ask(_joined(uncast, edges)), points) or first
     if found is not None and found.verdict == "ok" and (refused or alone_deg(found) < alone_deg(fit)):
-        return _doubtful(found, words)
+        return doubtful(found, words)
     plate = flat(uncast, edges)
     turned = None if plate is None else _answer(plate.fit, points)
     better = found is not None and (refused or alone_deg(found) < alone_deg(fit))
     if plate is not None and turned is not None:
         known = alone_deg(turned) < (PLATE_DEG if refused else alone_deg(fit))
         if known or plate.probability > PROBABLE:
-            return _doubtful(turned, words)
+            return doubtful(turned, words)
         better = better and found is not None and apart_deg(found, turned) < NEAR_DEG
-    return _doubtful(found, words) if found is not None and better else fit
+    return doubtful(found, words) if found is not None and better else fit
 
 
 def _unless_plainly_a_plate(fit: JointFit, plate: FlatFit | None, points: int) -> JointFit:
@@ -90,12 +87,7 @@ def _unless_plainly_a_plate(fit: JointFit, plate: FlatFit | None, points: int) -
         return fit
     if fit.axis is not None and fit.type == turned.type and apart_deg(fit, turned) < NEAR_DEG:
         return fit
-    return _doubtful(turned, DOUBTFUL)
-
-
-def _open(fit: JointFit) -> bool:
-    """Whether a joint is doubtful and its axis known to VAGUE_DEG or worse by its tracks alone."""
-    return fit.verdict == "ambiguous" and "axis_deg" in fit.std and alone_deg(fit) > VAGUE_DEG
+    return doubtful(turned, DOUBTFUL)
 
 
 def _joined(points: Tracks, edges: Tracks) -> Tracks:
@@ -115,12 +107,3 @@ def _answer(fit: JointFit, points: int) -> JointFit | None:
     if own.sum() < MIN_INLIERS or len(fit.members) - len(members) < MIN_INLIERS:
         return None
     return replace(fit, points=fit.points[own], point_track=fit.point_track[own], members=members, tracks=points)
-
-
-def _doubtful(fit: JointFit, words: str) -> JointFit:
-    """The joint as `ambiguous`: its type half by the prior, its axis and place FACTOR times less sure."""
-    p, std = or_by_prior(fit.type_probability), dict(fit.std)
-    for k in ("axis_deg", "point_m"):
-        if k in std:
-            std[k] = FACTOR * std[k]
-    return replace(fit, verdict="ambiguous", reason=f"{words}, {fit.reason}", type_probability=p, std=std)

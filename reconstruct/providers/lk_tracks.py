@@ -35,19 +35,27 @@ LEAST_PIECE = 8
 """Frames for which a point has to be followed after it lost its anchor; what is shorter is mostly no point at all."""
 EDGE = 0.1
 """Ratio of the structure tensor's eigenvalues below which errors along an edge pile up."""
+MARGIN_PX, CLOSE_PX = 5, -3
+"""By how much the mask of hands, which reaches a few px beyond them, is grown for points to be followed off them; and
+shrunk to follow points up to their rims, along which some slide then. Working px."""
 SHADOW_PX = 2.0
 """Extent of a track, working px, from which on it may be a shadow's."""
 
 
-def pictures_of(video: Video, hands: Hands | None = None) -> Pictures:
-    """The frames as points are followed in them: of even exposure, and nothing under hands."""
+def pictures_of(video: Video, hands: Hands | None = None, margin_px: int = MARGIN_PX) -> Pictures:
+    """The frames as points are followed in them: of even exposure, and nothing under hands.
+
+    Args:
+        margin_px: working px by which the mask of hands is grown, or shrunk if negative.
+    """
     import cv2
 
     h, w = video.frames.shape[1:3]
     covered = np.zeros((len(video), h, w), bool)
     if hands is not None and hands.mask is not None:
-        k = np.ones((11, 11), np.uint8)
-        covered = np.stack([cv2.dilate(m.astype(np.uint8), k) for m in hands.mask]) > 0
+        k = np.ones((2 * abs(margin_px) + 1,) * 2, np.uint8)
+        change = cv2.dilate if margin_px >= 0 else cv2.erode
+        covered = np.stack([change(m.astype(np.uint8), k) for m in hands.mask]) > 0
     return Pictures(np.stack(even_exposure(video)), covered, np.array([(w - 1) / 2, (h - 1) / 2]))
 
 
@@ -57,6 +65,7 @@ def track_points(
     references: np.ndarray | None = None,
     per_reference: int = 220,
     progress: Callable[[float], None] | None = None,
+    margin_px: int = MARGIN_PX,
 ) -> Tracks:
     """Seed and follow corners, and the grain of faint surfaces.
 
@@ -66,6 +75,7 @@ def track_points(
         references: (R,) frames in which to seed; chosen from the picture change when None.
         per_reference: at most this many corners a reference frame.
         progress: called with the done share in [0, 1].
+        margin_px: as of :func:`pictures_of`.
 
     Returns:
         Tracks in full px; points that are lost or under a hand are not visible.
@@ -73,7 +83,7 @@ def track_points(
     import cv2
 
     references = reference_frames(video, hands) if references is None else np.asarray(references)
-    seen = pictures_of(video, hands)
+    seen = pictures_of(video, hands, margin_px)
     grey, covered = seen.grey, seen.covered
     noise = pixel_noise(grey)
     start, reference, wide = seeds(video, grey, covered, references, noise, per_reference)

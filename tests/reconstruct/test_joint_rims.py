@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from reconstruct.cues import ProviderInfo, Tracks
+from reconstruct.joint.answers import FACTOR
 from reconstruct.joint.flat_fit import FlatFit
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.result import FREELY
-from reconstruct.joint.rims import FACTOR, unless_rims_tell
+from reconstruct.joint.rims import unless_rims_tell
 from reconstruct.video import Video
 
 T, POINTS, EDGES = 12, 30, 10

@@ -1,0 +1,44 @@
+"""A part that hands cover, asked again with points that are followed up to the hands' rims.
+
+Points are followed a few pixels off a hand, since along its rim they slide. Of a stapler under a hand that leaves
+nothing but strips between the fingers. Followed up to the rims the part has several times as many points, and the rims
+as well: where the first show a joint these do harm, and are not asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from reconstruct.cues import Hands, Tracks
+from reconstruct.joint.answers import alone_deg, doubtful, is_open
+from reconstruct.joint.models import JointFit
+from reconstruct.joint.result import FREELY
+from reconstruct.video import Video
+
+SHOW_NONE = "points off the hands show no joint, up to the hands' rims"
+LEAVE_OPEN = "points off the hands leave the axis open, up to the hands' rims"
+
+
+def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Hands, follow: Callable[[], Tracks],
+                         ask: Callable[[Tracks], JointFit]) -> tuple[Tracks, JointFit]:  # fmt: skip
+    """The tracks and their joint, or where it is refused or its axis open the tracks up to the hands' rims and theirs,
+    if that is sure or, of an open one, knows the axis better; doubtful in any case.
+
+    Not where a body that is carried freely refutes the joint, nor before a camera that moves.
+
+    Args:
+        fit: the joint of these tracks, or a refusal.
+        follow: for the tracks up to the hands' rims.
+        ask: for the joint of such.
+    """
+    refused = fit.verdict == "refused"
+    if not (refused or is_open(fit)) or FREELY in fit.reason or video.warp is not None:
+        return tracks, fit
+    if hands.mask is None or not hands.mask.any():
+        return tracks, fit
+    closer = follow()
+    found = ask(closer)
+    known = found.verdict != "refused" and "axis_deg" in found.std
+    if found.verdict == "ok" or (known and not refused and alone_deg(found) < alone_deg(fit)):
+        return closer, doubtful(found, SHOW_NONE if refused else LEAVE_OPEN)
+    return tracks, fit
