@@ -38,11 +38,20 @@ def apart_deg(one: JointFit, other: JointFit) -> float:
 def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
     """A joint of more tracks if its axis is known no worse than another's of few, else None.
 
-    It is doubtful where the two contradict each other.
+    It is doubtful where the two contradict each other. Where their types do, its type is as likely as the two say in
+    the mean, and None is returned where they say that it is the other one.
     """
     if alone_deg(joint) > AS_WELL * alone_deg(than):
         return None
-    return replace(joint, verdict="ambiguous") if contradicts(joint, than) else joint
+    if not contradicts(joint, than):
+        return joint
+    if joint.type == than.type:
+        return replace(joint, verdict="ambiguous")
+    types = {**than.type_probability, **joint.type_probability}
+    p = {k: (joint.type_probability.get(k, 0.0) + than.type_probability.get(k, 0.0)) / 2 for k in types}
+    if max(p, key=lambda k: p[k]) != joint.type:
+        return None
+    return replace(joint, verdict="ambiguous", type_probability=p)
 
 
 def alone_deg(fit: JointFit) -> float:

@@ -115,3 +115,15 @@ def test_of_two_doubtful_joints_the_one_of_more_tracks_counts_if_it_is_known_as_
     assert better_known(made("ok", 0.0, 0.1, np.arange(90), 3.0), doubtful).verdict == "ambiguous"
     assert better_known(made("ambiguous", 50.0, 0.1, np.arange(90), 25.0), doubtful).verdict == "ambiguous"
     assert better_known(made("ok", 50.0, 0.1, np.arange(90), 31.0), doubtful) is None
+
+
+@pytest.mark.parametrize("p_slide, taken", [(0.63, True), (0.9999, False)])
+def test_of_two_joints_of_different_types_none_is_surer_than_both_together(p_slide, taken):
+    slide = replace(made("ambiguous", 60.0, 0.1, np.arange(20), 20.0), type="prismatic",
+                    type_probability={"prismatic": p_slide, "revolute": 1 - p_slide})  # fmt: skip
+    hinge = replace(made("ok", 60.0, 0.1, np.arange(90), 3.0), type_probability={"revolute": 0.999, "prismatic": 0.001})
+    answer = better_known(hinge, slide)
+    assert (answer is not None) == taken
+    if answer is not None:
+        assert answer.type == "revolute" and answer.verdict == "ambiguous"
+        assert answer.type_probability["revolute"] == pytest.approx((0.999 + 0.37) / 2)
