@@ -30,9 +30,9 @@ def tracks(count: int) -> Tracks:
 FIRST, CLOSER = tracks(10), tracks(30)
 
 
-def joint(verdict: str, axis_deg: float, type: str = "revolute") -> JointFit:
+def joint(verdict: str, axis_deg: float, type: str = "revolute", axis=(0, 0, 1.0)) -> JointFit:
     p = {"revolute": 0.99, "prismatic": 0.01} if type == "revolute" else {"revolute": 0.01, "prismatic": 0.99}
-    return JointFit(verdict, "tracks agree", type, p, axis=np.array([0, 0, 1.0]), T_camera_world=np.eye(4),
+    return JointFit(verdict, "tracks agree", type, p, axis=np.array(axis), T_camera_world=np.eye(4),
                     std={"axis_deg": axis_deg, "point_m": 0.01})  # fmt: skip
 
 
@@ -80,7 +80,9 @@ def test_what_points_up_to_the_rims_show_counts_and_is_doubtful(fit, found):
 @pytest.mark.parametrize(
     "fit, found",
     [(REFUSED, REFUSED), (REFUSED, joint("ambiguous", 6.0)), (joint("ambiguous", 30.0), REFUSED),
-     (joint("ambiguous", 30.0), joint("ambiguous", 40.0))],
+     (joint("ambiguous", 30.0), joint("ambiguous", 40.0)),
+     (joint("ambiguous", 30.0), joint("ok", 6.0, axis=(1.0, 0, 0))),
+     (joint("ambiguous", 30.0), joint("ok", 6.0, "prismatic"))],
 )  # fmt: skip
-def test_what_they_know_no_better_does_not(fit, found):
+def test_what_they_know_no_better_or_what_contradicts_the_first_does_not(fit, found):
     assert given(fit, found) == (FIRST, fit)
