@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from reconstruct.cues import Hands, Tracks
-from reconstruct.joint.answers import alone_deg, contradicts, doubtful, is_open
+from reconstruct.joint.answers import AS_WELL, FACTOR, alone_deg, contradicts, doubtful, is_open
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.result import FREELY
 from reconstruct.video import Video
@@ -24,8 +24,9 @@ def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Han
     """The tracks and their joint, or where it is refused or its axis open the tracks up to the hands' rims and theirs,
     if that is sure or, of an open one, knows the axis better; doubtful in any case.
 
-    Not where it contradicts an open one, which may rest on more than points: what slides along rims agrees as well. Not
-    where a body that is carried freely refutes the joint, nor before a camera that moves.
+    One that contradicts an open one, which may rest on more than points, has to know the axis AS_WELL times better than
+    that as it is stated: what slides along rims agrees as well. Not where a body that is carried freely refutes the
+    joint, nor before a camera that moves.
 
     Args:
         fit: the joint of these tracks, or a refusal.
@@ -41,5 +42,7 @@ def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Han
     found = ask(closer)
     if refused:
         return (closer, doubtful(found, SHOW_NONE)) if found.verdict == "ok" else (tracks, fit)
-    better = found.verdict != "refused" and "axis_deg" in found.std and alone_deg(found) < alone_deg(fit)
-    return (closer, doubtful(found, LEAVE_OPEN)) if better and not contradicts(fit, found) else (tracks, fit)
+    if found.verdict == "refused" or "axis_deg" not in found.std:
+        return tracks, fit
+    least = AS_WELL * FACTOR if contradicts(fit, found) else 1.0
+    return (closer, doubtful(found, LEAVE_OPEN)) if least * alone_deg(found) < alone_deg(fit) else (tracks, fit)
