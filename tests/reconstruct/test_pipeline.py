@@ -21,7 +21,9 @@ import taa_envs
 from reconstruct.cues import Hands, ProviderInfo
 from reconstruct.errors import Refused, TaaError
 from reconstruct.joint.fit import fit_joint
-from reconstruct.pipeline import Seen, Stages, fit_scene, reconstruct, with_advice
+from reconstruct.joint.models import JointFit
+from reconstruct.pipeline import Seen, Silent, Stages, _up_to_hands, fit_scene, reconstruct, with_advice
+from reconstruct.providers.lk_tracks import CLOSE_PX
 from reconstruct.report import refusal_report, short
 from reconstruct.synth import load_truth, render_clip, write_cues
 from taa_envs.errors import AssetExists, GateFailed
@@ -223,6 +225,33 @@ def test_a_doubtful_joint_whose_body_misbehaves_is_refused(tmp_path, monkeypatch
     assert result.error == "two fit; it does not pass the gate: it does not come to rest"
     assert "come to rest" in (tmp_path / "scene" / "report.html").read_text(encoding="utf-8")
     assert not (tmp_path / "assets").exists()
+
+
+def test_the_tracks_up_to_hands_take_the_place_of_the_others_and_are_kept_in_the_scene_folder(tmp_path, monkeypatch):
+    scene = make_scene("revolute", [0.0, 1.0, 0.2], [-0.2, 0.0, 1.6], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.9)
+    fit, few = fit_joint(scene.video, scene.tracks, focal_px=768.0), scene.tracks.of(np.arange(30))
+    hands = Hands((), np.ones(scene.video.frames.shape[:3], bool), ProviderInfo("made", "0", "Apache-2.0"))
+    calls = []
+
+    def follow(video, hands, **options):
+        calls.append(options["margin_px"])
+        return scene.tracks
+
+    def joint(video, tracks, *rest):
+        assert len(tracks.uv) == len(scene.tracks.uv) and rest[-1] == CLOSE_PX
+        calls.append("joint")
+        return fit
+
+    monkeypatch.setattr("reconstruct.providers.lk_tracks.track_points", follow)
+    monkeypatch.setattr("reconstruct.pipeline.joint_off_the_arm", joint)
+    for _ in range(2):
+        stages = Stages(tmp_path, Silent())
+        tracks, found = _up_to_hands(JointFit("refused", "too few"), scene.video, few, hands, None, 0, stages)
+        assert len(tracks.uv) == len(scene.tracks.uv) and found.verdict == "ambiguous" and found.type == "revolute"
+        np.testing.assert_array_equal(found.point_track, fit.point_track)
+    assert calls == [CLOSE_PX, "joint"]
+    known = replace(fit, verdict="ok")
+    assert _up_to_hands(known, scene.video, few, hands, None, 0, Stages(None, Silent())) == (few, known)
 
 
 def test_a_camera_cut_is_refused(tmp_path):
