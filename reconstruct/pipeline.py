@@ -305,8 +305,12 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
         folder = cues_io.CueFolder(scene, stages.chosen)
         given = folder.given()
     tracks = stages.run("tracks", follow, TRACKING, given=given.get("tracks"))
-    tracks, fit, words, unit = _joint(stable, hands, tracks, focal, camera, folder, given, seed, stages)
     if folder:
+        folder.write("tracks", cues_io.track_arrays(tracks))
+    first = tracks
+    tracks, fit, words, unit = _joint(stable, hands, first, focal, camera, folder, given, seed, stages,
+                                      pixels="tracks" not in given)  # fmt: skip
+    if folder and tracks is not first:
         folder.write("tracks", cues_io.track_arrays(tracks))
     if folder and fit.verdict != "refused":
         folder.write("camera", cues_io.camera_arrays(fit, len(stable)))
@@ -375,11 +379,15 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
 
 
 def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, camera: cues_io.Arrays | None,
-           folder: cues_io.CueFolder | None, given: Mapping[str, str], seed: int,
-           stages: Stages) -> tuple[Tracks, JointFit, list[str], float]:  # fmt: skip
+           folder: cues_io.CueFolder | None, given: Mapping[str, str], seed: int, stages: Stages,
+           pixels: bool) -> tuple[Tracks, JointFit, list[str], float]:  # fmt: skip
     """The tracks that it is a joint of: those given, or some up to the hands' rims; the joint, metric where a scale is
     known, in the world of the user's camera where there is one; notes; and the length of that world's unit in the
-    joint's."""
+    joint's.
+
+    Args:
+        pixels: whether the video's pixels may be followed once more.
+    """
     from reconstruct.depth import depth_scale
     from reconstruct.hand.scale import hand_scale
     from reconstruct.joint.rigid.cues import fit_from_cues
@@ -412,7 +420,7 @@ def _joint(video: Video, hands: Hands, tracks: Tracks, focal: float | None, came
         notes.append(f"the tracks with depth hold no joint ({fit.reason}); fitted again without depth")
         ranged = False
         fit = stages.run("joint", find, JOINT, options={"focal": focal, "with_depth": None})
-    if not ranged and "tracks" not in given:
+    if pixels and not ranged:
         tracks, fit = _up_to_hands(fit, video, tracks, hands, focal, seed, stages)
     if fit.verdict == "refused":
         return tracks, fit, notes, 1.0
@@ -649,5 +657,5 @@ def fit_scene(scene: str | Path, focal: float | None = None, seed: int = 0, prog
         nobody = Hands((), np.zeros((len(video), 1, 1), bool), cues_io.GIVEN)
         hands = found if isinstance(found, Hands) and found.mask.shape[0] == len(video) else nobody
     stages = Stages(None, progress or Silent())
-    fit, _, _ = _joint(video, hands, tracks, focal, camera, folder, given, seed, stages)
+    _, fit, _, _ = _joint(video, hands, tracks, focal, camera, folder, given, seed, stages, pixels=False)
     return {**joint_object(fit, video.index), **further_objects(fit, video.index)}
