@@ -106,7 +106,7 @@ def _without_depth(given: Given, focal_known: bool, seed: int) -> tuple[Given, J
 
 def _of_pixels(given: Given, hands: Hands, frames: np.ndarray, tracks: Tracks, focal: float | None, seed: int
                ) -> tuple[Given, JointFit]:  # fmt: skip
-    """As the pipeline does."""
+    """As the pipeline does: a clip's pixels (T, h, w, 3) uint8 BGR, its tracks, focal length in px."""
     from benchmarks.articulation.pixels import video_of, with_tracks
     from reconstruct.joint.closer import unless_hands_hide_it
     from reconstruct.pipeline import joint_off_the_arm
@@ -114,11 +114,13 @@ def _of_pixels(given: Given, hands: Hands, frames: np.ndarray, tracks: Tracks, f
 
     video = video_of(frames)
 
-    def ask(some: Tracks, margin_px: int | None = None) -> JointFit:
+    def follow() -> Tracks:
+        return track_points(video, hands, margin_px=CLOSE_PX)
+
+    def ask(some: Tracks, margin_px: int | None = CLOSE_PX) -> JointFit:
         return joint_off_the_arm(video, some, hands, focal, seed, lambda _: None, margin_px)
 
-    used, fit = unless_hands_hide_it(ask(tracks), video, tracks, hands, lambda: track_points(video, hands,
-                                     margin_px=CLOSE_PX), lambda some: ask(some, CLOSE_PX))  # fmt: skip
+    used, fit = unless_hands_hide_it(ask(tracks, None), video, tracks, hands, follow, ask)
     return given if used is tracks else with_tracks(given, used), fit
 
 

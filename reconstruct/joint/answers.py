@@ -15,7 +15,7 @@ AS_WELL = 1.5
 """Ratio of what two joints state of their axes up to which these are known alike."""
 FACTOR = 2.0
 """How many times what is stated joints are off that are taken for want of a better one (the root of the mean square of
-nine rendered ones by straight edges, 0.1 to 3.6; of four by points up to the hands' rims, 0.5 to 3.1)."""
+nine rendered ones by straight edges, 0.1 to 3.6; 1.2 of fourteen by points up to hands' rims, 0.02 to 3.1)."""
 
 
 def contradicts(one: JointFit, other: JointFit) -> bool:

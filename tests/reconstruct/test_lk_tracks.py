@@ -21,12 +21,17 @@ from tests.reconstruct.joint_scenes import make_video
 from tests.reconstruct.textures import turning_plate
 
 
-def test_tracks_follow_the_plate_and_stay_off_hands():
+def plate_beneath_a_hand():
+    """A video, a hand that covers the same pixels in all of its 24 frames, and the plate's homographies."""
     frames, H = turning_plate(24)
-    video = make_video(len(frames)).with_frames(frames)
     mask = np.zeros(frames.shape[:3], bool)
     mask[:, 150:190, 200:260] = True
-    hands = Hands((), mask, ProviderInfo("made", "0", "Apache-2.0"))
+    return make_video(len(frames)).with_frames(frames), Hands((), mask, ProviderInfo("made", "0", "Apache-2.0")), H
+
+
+def test_tracks_follow_the_plate_and_stay_off_hands():
+    video, hands, H = plate_beneath_a_hand()
+    mask = hands.mask
     tracks = track_points(video, hands)
     extent = np.linalg.norm(np.nanmax(tracks.uv, axis=1) - np.nanmin(tracks.uv, axis=1), axis=-1)
     moving = np.flatnonzero((extent > 10) & (tracks.visible.sum(1) > 8))
@@ -53,11 +58,7 @@ def test_tracks_follow_the_plate_and_stay_off_hands():
 
 
 def test_points_are_followed_off_hands_by_a_margin_that_may_be_given():
-    frames, _ = turning_plate(24)
-    video = make_video(len(frames)).with_frames(frames)
-    mask = np.zeros(frames.shape[:3], bool)
-    mask[:, 150:190, 200:260] = True
-    hands = Hands((), mask, ProviderInfo("made", "0", "Apache-2.0"))
+    video, hands, _ = plate_beneath_a_hand()
     for margin, found in ((MARGIN_PX, pictures_of(video, hands)), (CLOSE_PX, pictures_of(video, hands, CLOSE_PX))):
         y, x = np.nonzero(found.covered[0])
         assert (y.min(), y.max(), x.min(), x.max()) == (150 - margin, 189 + margin, 200 - margin, 259 + margin)
