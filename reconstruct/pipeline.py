@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,7 @@ from reconstruct.video import Video, load_video
 from taa_envs.files import written_whole
 
 if TYPE_CHECKING:
+    from reconstruct.providers.edge_tracks import Segments
     from taa_envs.asset import Asset
 
 
@@ -330,7 +332,8 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     mostly an arm's counts. Shadows go nearly as the part goes too. What may be the edge of one is left out where enough
     else moves, and asked where nothing is found without it. What one straight edge alone follows is no sure joint.
     Where a body refutes it that is carried freely, what the hands carry is left out. Where nothing is found at all,
-    or the joint stays in doubt, the part's straight edges are followed and asked too.
+    or the joint stays in doubt, the part's straight edges are followed and asked too. States that its points do not
+    show are looked for by these.
 
     Args:
         margin_px: how far off hands pictures are looked at, as of :func:`lk_tracks.pictures_of`; as usual when None.
@@ -342,7 +345,8 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     from reconstruct.joint.handling import unless_carried
     from reconstruct.joint.rims import unless_rims_tell
     from reconstruct.joint.shadows import off_shadows, unless_a_shadow
-    from reconstruct.providers.edge_tracks import edge_tracks
+    from reconstruct.joint.unseen import with_unseen_states
+    from reconstruct.providers.edge_tracks import all_segments, edge_tracks
     from reconstruct.providers.lk_tracks import MARGIN_PX, pictures_of
 
     pictures = pictures_of(video, hands, MARGIN_PX if margin_px is None else margin_px)
@@ -354,8 +358,13 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     def ask(some: Tracks) -> JointFit:
         return fit_joint(video, some, focal, seed, progress, camera_moving=False, pictures=pictures)
 
+    @functools.cache
+    def lines() -> list[Segments]:
+        return all_segments(video, pictures)
+
+    @functools.cache
     def rims() -> Tracks:
-        edges = edge_tracks(video, pictures)
+        edges = edge_tracks(video, pictures, lines())
         return edges.of(~on_forearm(edges, hands))
 
     def flat(points: Tracks, edges: Tracks) -> FlatFit | None:
@@ -374,6 +383,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
             return again
     fit = unless_carried(fit, video, rest, hands, off_shadows_too)
     fit = unless_rims_tell(fit, video, rest, rims, ask, flat)
+    fit = with_unseen_states(fit, video, pictures, rest, rims, lines)
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
 

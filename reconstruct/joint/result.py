@@ -130,7 +130,7 @@ def result_of(
         residual_px=float(np.median(r)) / video.scale,
         inliers=len(done.members),
         tracks=tracks,
-        moving_frames=_moving_frames(q, video.time),
+        moving_frames=moving_frames(q, video.time),
     )
     return replace(fit, image_line=image_line(fit), alone_deg=done.alone_deg, members=done.members)
 
@@ -152,7 +152,7 @@ def stay(b: Bundle, s: Sightings) -> np.ndarray:
     return np.ones(len(near), bool)
 
 
-def _moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:
+def moving_frames(q: np.ndarray, time: np.ndarray) -> np.ndarray:
     """(T,) frames in which |dq/dt| exceeds 4 % of the range a second, and 10 % of its upper quartile."""
     rate = np.abs(np.gradient(q, time))
     return rate > max(0.04 * np.ptp(q), 0.1 * np.quantile(rate, 0.95))

@@ -62,12 +62,13 @@ class Segments:
         return Segments(self.middle[rows], self.along[rows], self.length[rows], self.sides[rows])
 
 
-def edge_tracks(video: Video, pictures: Pictures) -> Tracks:
+def edge_tracks(video: Video, pictures: Pictures, every: list[Segments]) -> Tracks:
     """Points along the straight edges that move, without those of shadows.
 
     Args:
         video: of a camera at rest.
         pictures: of its frames, and what hands cover.
+        every: each frame's straight edges, as of :func:`all_segments`.
 
     Returns:
         Tracks in full px; from frame to frame each goes across its edge only, and its slip is all along it. None is
@@ -76,7 +77,6 @@ def edge_tracks(video: Video, pictures: Pictures) -> Tracks:
     import cv2
 
     T = len(video)
-    every = [segments(pictures.grey[t], video.frames[t], pictures.covered[t]) for t in range(T)]
     uv, slip, start, of = [np.zeros((0, T, 2))], [np.zeros((0, T, 2))], [np.zeros(0, int)], [np.zeros(0, int)]
     for chain in followed(every):
         if len(chain) < LIFE:
@@ -96,6 +96,11 @@ def edge_tracks(video: Video, pictures: Pictures) -> Tracks:
     edge = np.concatenate(of)
     shadow = np.bincount(edge, cast) >= MOSTLY * np.bincount(edge)
     return replace(tracks, cast=shadow[edge]).of(~cast)
+
+
+def all_segments(video: Video, pictures: Pictures) -> list[Segments]:
+    """The straight edges of every frame that are not a hand's."""
+    return [segments(pictures.grey[t], video.frames[t], pictures.covered[t]) for t in range(len(video))]
 
 
 def segments(grey: np.ndarray, colour: np.ndarray, covered: np.ndarray) -> Segments:

@@ -8,7 +8,7 @@ import pytest
 
 from reconstruct.cues import Tracks
 from reconstruct.joint.photometric import Pictures
-from reconstruct.providers.edge_tracks import LIFE, edge_tracks, segments
+from reconstruct.providers.edge_tracks import LIFE, all_segments, edge_tracks, segments
 from reconstruct.video import Video
 
 T, W, H = 20, 320, 240
@@ -50,6 +50,11 @@ def pictures(video: Video, covered: np.ndarray | None = None) -> Pictures:
     return Pictures(grey, hidden, np.array([(W - 1) / 2, (H - 1) / 2]))
 
 
+def followed_in(video: Video) -> Tracks:
+    p = pictures(video)
+    return edge_tracks(video, p, all_segments(video, p))
+
+
 def long_sides(tracks: Tracks) -> np.ndarray:
     """(N,) bool: seeded on one of the bar's long sides."""
     out = np.zeros(len(tracks.uv), bool)
@@ -76,7 +81,7 @@ def off_px(tracks: Tracks, rows: np.ndarray) -> np.ndarray:
 
 def test_a_plain_bars_sides_are_held_to_a_tenth_of_a_pixel_over_a_mottled_ground():
     video = film()
-    tracks = edge_tracks(video, pictures(video))
+    tracks = followed_in(video)
     rows = np.flatnonzero(long_sides(tracks))
     assert len(rows) >= 8
     assert np.median(tracks.visible[rows].sum(1)) >= 0.5 * T
@@ -87,7 +92,7 @@ def test_a_plain_bars_sides_are_held_to_a_tenth_of_a_pixel_over_a_mottled_ground
 
 def test_slip_is_all_along_the_edge_and_nothing_where_it_is_not_seen():
     video = film()
-    tracks = edge_tracks(video, pictures(video))
+    tracks = followed_in(video)
     for i in np.flatnonzero(long_sides(tracks)):
         f = int(tracks.reference[i])
         c = corners(f)
@@ -100,7 +105,7 @@ def test_slip_is_all_along_the_edge_and_nothing_where_it_is_not_seen():
 
 def test_from_frame_to_frame_a_point_goes_across_its_edge_only():
     video = film()
-    tracks = edge_tracks(video, pictures(video))
+    tracks = followed_in(video)
     rows = np.flatnonzero(long_sides(tracks))
     step, slip = np.diff(tracks.uv[rows], axis=1), tracks.slip[rows]
     both = tracks.visible[rows][:, 1:] & tracks.visible[rows][:, :-1]
@@ -112,7 +117,7 @@ def test_from_frame_to_frame_a_point_goes_across_its_edge_only():
 
 def test_what_rests_gives_no_tracks():
     video = film(turns=False)
-    assert len(edge_tracks(video, pictures(video)).uv) == 0
+    assert len(followed_in(video).uv) == 0
 
 
 def test_what_a_hand_covers_gives_no_segments():
@@ -126,8 +131,8 @@ def test_what_a_hand_covers_gives_no_segments():
 
 def test_a_shadows_edges_are_left_out():
     bar, shadow = film(), film(shadow=True)
-    on_bar = edge_tracks(bar, pictures(bar))
-    on_shadow = edge_tracks(shadow, pictures(shadow))
+    on_bar = followed_in(bar)
+    on_shadow = followed_in(shadow)
     assert long_sides(on_bar).sum() >= 8
     assert long_sides(on_shadow).sum() <= 0.2 * long_sides(on_bar).sum()
 
