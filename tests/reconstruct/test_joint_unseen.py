@@ -34,12 +34,18 @@ def project(X: np.ndarray) -> np.ndarray:
     return x[..., :2] / x[..., 2:]
 
 
-def at(q: float, X: np.ndarray) -> np.ndarray:
-    G = joint_transform("revolute", AXIS, POINT, q)
+WAY = np.array([-0.8, 0.0, -0.6])
+STROKE = 0.3 * Q / Q[-1]
+"""A drawer that comes out to the left."""
+
+
+def at(q: float, X: np.ndarray, kind: str = "revolute") -> np.ndarray:
+    """Where the link's points are; a hinge's states count the other way round here."""
+    G = joint_transform(kind, -AXIS if kind == "revolute" else WAY, POINT, q)
     return X @ G[:3, :3].T + G[:3, 3]
 
 
-def film(seen: bool = True) -> Video:
+def film(seen: bool = True, kind: str = "revolute") -> Video:
     """The door before a mottled wall with some lines that rest; without the door if it is not to be seen."""
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.normal(size=(H, W)).astype(np.float32), (0, 0), 4)
@@ -47,10 +53,10 @@ def film(seen: bool = True) -> Video:
     for x in (30, 250, 290):
         cv2.line(wall, (x, 20), (x + 8, 220), (60, 60, 90), 2, cv2.LINE_AA)
     frames = []
-    for q in Q:
+    for q in Q if kind == "revolute" else STROKE:
         picture = wall.copy()
         if seen:
-            corners = (project(at(-q, DOOR)) * 16).round().astype(int)
+            corners = (project(at(q, DOOR, kind)) * 16).round().astype(int)
             cv2.fillPoly(picture, [corners], (60, 40, 90), cv2.LINE_AA, 4)
         frames.append(picture)
     return Video(Path("door.mp4"), "0" * 64, (W, H), np.arange(T) / 24, np.arange(T), T, np.stack(frames), 1.0)
@@ -63,11 +69,12 @@ def pictures(video: Video, covered: slice | None = None) -> Pictures:
     return Pictures(np.stack([cv2.cvtColor(f, cv2.COLOR_BGR2GRAY) for f in video.frames]), hidden, K[:2, 2])
 
 
-def tracks() -> Tracks:
+def tracks(kind: str = "revolute") -> Tracks:
     """Of points on the door, half of them in its first frames and half in its last."""
     rng = np.random.default_rng(1)
     X = np.column_stack([rng.uniform(-0.18, 0.18, (60, 2)), np.full(60, 1.2)])
-    uv = np.stack([project(at(-q, X)) for q in Q], axis=1) + rng.normal(0, 0.1, (60, T, 2))
+    uv = np.stack([project(at(q, X, kind)) for q in (Q if kind == "revolute" else STROKE)], axis=1)
+    uv = uv + rng.normal(0, 0.1, (60, T, 2))
     visible = np.zeros((60, T), bool)
     visible[:30, FIRST], visible[30:, LAST] = True, True
     reference = np.where(np.arange(60) < 30, 0, T - 1)
@@ -88,9 +95,9 @@ def fit(points: Tracks) -> JointFit:
                     members=np.arange(60))  # fmt: skip
 
 
-def asked(f: JointFit, video: Video, p: Pictures) -> JointFit:
+def asked(f: JointFit, video: Video, p: Pictures, kind: str = "revolute") -> JointFit:
     every = all_segments(video, p)
-    return with_unseen_states(f, video, p, tracks(), lambda: edge_tracks(video, p, every), lambda: every)
+    return with_unseen_states(f, video, p, tracks(kind), lambda: edge_tracks(video, p, every), lambda: every)
 
 
 def test_edges_bridge_what_points_do_not() -> None:
@@ -106,12 +113,25 @@ def test_edges_bridge_what_points_do_not() -> None:
     np.testing.assert_allclose(out.T_camera_world[:3, :3] @ out.axis, f.axis, atol=1e-9)
 
 
+def test_edges_bridge_a_drawer() -> None:
+    video, f = film(kind="prismatic"), fit(tracks())
+    q = STROKE.copy()
+    q[LAST] -= 0.08
+    q[16:22] = np.interp(np.arange(16, 22), [15, 22], [q[15], q[22]])
+    std = {**f.std, "q": np.where(np.arange(T) < 16, 0.001, np.ptp(q))}
+    f = replace(f, type="prismatic", axis=WAY, point=None, q=q, std=std)
+    out = asked(f, video, pictures(video), "prismatic")
+    assert np.abs(out.q - STROKE).max() < 0.005 and np.abs(f.q - STROKE).max() > 0.07
+    assert np.all(np.abs(out.q - STROKE)[1:] < 3 * out.std["q"][1:]) and out.std["q"].max() < 0.1 * 0.3
+    assert out.point is None
+
+
 def test_a_first_state_that_nothing_showed_moves_the_points_to_where_it_is() -> None:
     video, f = film(), fit(tracks())
     # The last frames are right, and nothing shows the first: state 0 is what is OFF in truth.
     q = np.interp(np.arange(T), np.r_[0, np.arange(LAST.start, T)], np.r_[0, Q[LAST] - OFF])
     std = {**f.std, "q": np.where(np.arange(T) > 0, np.ptp(q), 0.0)}
-    wrong = replace(f, q=q, points=at(-OFF, f.points), std=std, members=np.arange(30, 60))
+    wrong = replace(f, q=q, points=at(OFF, f.points), std=std, members=np.arange(30, 60))
     assert np.degrees(np.abs(wrong.q - Q).max()) > 25
     out = asked(wrong, video, pictures(video))
     np.testing.assert_allclose(out.q, Q, atol=np.radians(2))

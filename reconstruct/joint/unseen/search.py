@@ -7,8 +7,8 @@ import numpy as np
 from reconstruct.joint.unseen.going import Going
 from reconstruct.joint.unseen.outline import Edges, Outline
 
-AROUND = {"revolute": 2.2, "screw": 2.2}
-"""How far beyond the known states others are looked for, rad; for a slide as far as the known stroke is."""
+AROUND, STROKES = 2.2, 3.0
+"""How far beyond the known states others are looked for, rad; for a slide over the known stroke."""
 STATES = (50, 1500)
 """That are tried, at least and at most; about one a px that the outline goes."""
 REACH, LEAST_REACH, SPEED = 2.0, 0.02, 0.1
@@ -42,7 +42,7 @@ def states_shown(outline: Outline, edges: Edges, going: Going, q: np.ndarray, be
     """
     there = np.flatnonzero(before)
     low, high, span = q[before].min(), q[before].max(), float(np.ptp(q[before]))
-    beyond = AROUND.get(going.kind, span)
+    beyond = STROKES * span if going.kind == "prismatic" else AROUND
     speed = outline.speed(going.pose, q[there[[0, -1]]], going.focal)
     count = int(np.clip((span + 2 * beyond) * speed, *STATES))
     tried = np.linspace(low - beyond, high + beyond, count)
