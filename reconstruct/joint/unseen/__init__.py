@@ -27,7 +27,7 @@ from reconstruct.video import Video
 
 OPEN = 0.1
 """Standard deviation of a state over the stroke from which on it is looked for."""
-ROUNDS = 6
+ROUNDS = 8
 """Outlines at most, each by the states that the last one found."""
 
 
@@ -65,9 +65,14 @@ def with_unseen_states(fit: JointFit, video: Video, pictures: Pictures, points: 
     if found.sum() == before.sum():
         return fit
     q, std = settled(q, before, found, outline, going, fit.std)
-    T = np.arange(len(q))
-    q = np.interp(T, T[found], q[found])
-    std = np.where(found & found[0], np.minimum(std, np.ptp(q)), np.ptp(q))
+    # Where nothing is shown the states go with those around as they did before.
+    T, moved = np.arange(len(q)), np.where(found, q - fit.q, 0.0)
+    moved = np.interp(T, T[found], moved[found])
+    q, open_ = fit.q + moved, np.asarray(fit.std["q"])
+    as_before = np.hypot(open_, moved)
+    if not found[0]:
+        std = np.where(before, as_before, np.hypot(std, np.median(open_[before])))
+    std = np.minimum(np.where(found, std, as_before), np.ptp(q))
     std[0] = 0.0
     reason = f"{fit.reason}; its edges show {int((found & ~before).sum())} of {len(q)} states"
     return replace(from_first(fit, video, q, std), reason=reason)

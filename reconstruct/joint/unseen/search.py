@@ -24,9 +24,12 @@ SAME_PX, LESS = 8.0, 0.5
 """Way of most of an outline up to which two states are nearly the same, and the share over the least one that is enough
 for a state that an earlier outline has shown so."""
 STRETCH = 0.5
-"""How far beyond the states that an outline was made by it shows others, over their stroke."""
+"""How far beyond the states that an outline was made by it shows others, over their stroke, and over how many frames,
+over their number."""
 LONGEST = 8
-"""Frames without a state that may lie between two with one."""
+"""Frames from one with a state to the next at most."""
+ABOUT, ABOUT_SEEN = 2, 0.6
+"""Frames to either side of one, and the share of these that has to show a state too."""
 
 
 def states_shown(outline: Outline, edges: Edges, going: Going, q: np.ndarray, before: np.ndarray, earlier: np.ndarray
@@ -64,8 +67,9 @@ def states_shown(outline: Outline, edges: Edges, going: Going, q: np.ndarray, be
     usual = np.median([share(t, q[[t]])[0] for t in looks])
     least = max(SHOWN, AS_KNOWN * float(usual))
     # A line is known by how it went, and no further on than that.
-    stretch = STRETCH * float(np.ptp(q[earlier]))
+    stretch, ahead = STRETCH * float(np.ptp(q[earlier])), max(int(STRETCH * earlier.sum()), LONGEST)
     low, high = q[earlier].min() - stretch, q[earlier].max() + stretch
+    first, final = np.flatnonzero(earlier)[[0, -1]] + [-ahead, ahead]
     q, found = q.copy(), before.copy()
     for frames in (range(there[-1] + 1, len(q)), range(there[0] - 1, -1, -1)):
         if not len(frames):
@@ -73,16 +77,23 @@ def states_shown(outline: Outline, edges: Edges, going: Going, q: np.ndarray, be
         start = there[-1] if frames[0] > there[-1] else there[0]
         shares = np.maximum([share(t, tried) - clutter for t in frames], 0.0)
         path = _best_path(shares, int(np.abs(tried - q[start]).argmin()), reach, SPEED * (step / largest) ** 2)
-        missed = 0
-        for t, k, row in zip(frames, path, shares, strict=True):
-            same = earlier[t] and abs(tried[k] - q[t]) * speed < SAME_PX
-            near = low <= tried[k] <= high
-            missed = missed + 1 if row[k] < (LESS * least if same else least) or not near else 0
-            if missed > LONGEST:
+        same = earlier[frames] & (np.abs(tried[path] - q[frames]) * speed < SAME_PX)
+        seen = shares[np.arange(len(path)), path] >= np.where(same, LESS * least, least)
+        seen &= (low <= tried[path]) & (tried[path] <= high) & (first <= np.array(frames)) & (np.array(frames) <= final)
+        seen, last = _not_alone(seen), start
+        for t, k, row in zip(np.array(frames)[seen], path[seen], shares[seen], strict=True):
+            if abs(t - last) > LONGEST:
                 break
-            if not missed:
-                q[t], found[t] = _peak(tried, row, k), True
+            q[t], found[t], last = _peak(tried, row, k), True, t
     return q, found
+
+
+def _not_alone(seen: np.ndarray) -> np.ndarray:
+    """(F,) without frames about which others are not seen: from a known one outwards."""
+    known = np.concatenate([np.ones(ABOUT, bool), seen])
+    kernel = np.ones(2 * ABOUT + 1)
+    share = np.convolve(known, kernel, "same") / np.convolve(np.ones(len(known)), kernel, "same")
+    return seen & (share[ABOUT:] >= ABOUT_SEEN)
 
 
 def _best_path(shares: np.ndarray, start: int, reach: int, cost: float) -> np.ndarray:

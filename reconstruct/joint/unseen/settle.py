@@ -17,7 +17,7 @@ TRACKS = 200
 """Tracks in it."""
 NOISE_PX, LAST = 0.2, 4.0
 """Noise of a track, working px, and independent looks at it in a film: its errors last."""
-EDGE_PX, GROWS = 1.0, 0.1
+EDGE_PX, GROWS = 1.0, 0.2
 """Noise of an outline, working px, and by how much its state's grows with the way from those that it was made by: lines
 that are known by a short way are off in depth."""
 
