@@ -35,8 +35,8 @@ def with_unseen_states(fit: JointFit, video: Video, pictures: Pictures, points: 
                        segments: Callable[[], Sequence[Segments]]) -> JointFit:  # fmt: skip
     """The joint with the states that its own tracks leave open found by the straight edges of its link.
 
-    Axis and place stay as they are, and so do the most frames that its own tracks hold together. Where nothing shows a
-    state it is between those around, and its standard deviation the stroke.
+    Axis and place stay as they are, and so do the most frames that its own tracks hold together. States that nothing
+    shows go with those around as they did before, and are no better known.
 
     Args:
         fit: a joint up to scale before a resting camera, or a refusal.

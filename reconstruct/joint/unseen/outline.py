@@ -19,6 +19,8 @@ BINS, ASIDE_DEG = 12, 15.0
 """Directions that pictures are kept in, and how far from the middle of one a segment's may be."""
 MISS_PX, FAR_PX = 2.0, 6.0
 """Scale of how far a line may miss an edge, and the distance that is not told from larger ones."""
+KEPT = 64
+"""Pictures whose edges are kept drawn, some 4 MB each."""
 RESTS, RESTS_PX, LOOKS = 0.5, 1.5, 24
 """Share of the frames with known states in which an edge has to be in one place to rest, how near, and how many are
 looked at."""
@@ -63,15 +65,12 @@ class Edges:
         for t in looks:
             count += _distances(_drawn(segments[t], covered.shape[1:]), RESTS_PX + 1) < RESTS_PX
         self.rests = count >= np.maximum(RESTS * (~covered[looks]).sum(0), 1)
-        self._of: dict[int, np.ndarray] = {}
+        self._near: dict[int, np.ndarray] = {}
 
     def share(self, t: int, outline: Outline, pose: Callable[[np.ndarray], np.ndarray], q: np.ndarray, focal: float
               ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """(m,) share of the outline in states q (m,) that is on edges of picture t, of what is in sight, and (m,) what
         share that is."""
-        if t not in self._of:
-            drawn = _drawn(self.segments[t], self.covered.shape[1:]) & ~self.rests
-            self._of[t] = _distances(drawn, FAR_PX)
         p, way, depth = projected(outline, pose, q, focal)
         k = ((np.degrees(np.arctan2(way[..., 1], way[..., 0])) % 180) * BINS / 180).astype(int) % BINS
         h, w = self.covered.shape[1:]
@@ -79,9 +78,18 @@ class Edges:
         inside = (x >= 0) & (x < w) & (y >= 0) & (y < h) & (depth > 0)
         x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
         weight = outline.weight * (inside & ~self.covered[t][y, x])
-        on = np.exp(-0.5 * (self._of[t][k, y, x] / MISS_PX) ** 2)
         total = weight.sum(1)
-        return (weight * on).sum(1) / np.maximum(total, 1e-9), total / outline.weight.sum()
+        on = (weight * self.near(t)[k, y, x]).sum(1) / 255
+        return on / np.maximum(total, 1e-9), total / outline.weight.sum()
+
+    def near(self, t: int) -> np.ndarray:
+        """(BINS, h, w) uint8: 255 on an edge of picture t of about each direction, less beside it."""
+        if t not in self._near:
+            if len(self._near) >= KEPT:
+                self._near.pop(next(iter(self._near)))
+            drawn = _drawn(self.segments[t], self.covered.shape[1:]) & ~self.rests
+            self._near[t] = (255 * np.exp(-0.5 * (_distances(drawn, FAR_PX) / MISS_PX) ** 2)).astype(np.uint8)
+        return self._near[t]
 
 
 def projected(outline: Outline, pose: Callable[[np.ndarray], np.ndarray], q: np.ndarray, focal: float
