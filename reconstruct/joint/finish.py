@@ -60,6 +60,9 @@ VOTERS = 0.15
 FEW_SPEAK, BENT_DEG = (3.0, 2.0), 10.0
 """Votes for a hinge, and neighbourhoods whose middle track is for it, in standard deviations: below both it is a few
 tracks that speak for it, however much each of them gains; and the turn up to which strays bend a slide."""
+SHAPELY = 0.95
+"""Share of a link's points that are near each other: of 11 right joints of small motions all of them, of a wrong slide
+0.86."""
 UNDECIDED = 1.0
 """Log odds that are left where points out of all proportion to the link would turn the answer round, or the votes."""
 NEAR, HELD = 4.0, 30.0
@@ -542,8 +545,9 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
     z, most = votes(*costs, near_each_other), majority(*costs, near_each_other)
     few = z < FEW_SPEAK[0] and most < FEW_SPEAK[1]
     if odds > 0 > alone and few and turn_deg(hinge) < BENT_DEG:
-        # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is.
-        odds = alone
+        # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is. But a slide whose
+        # points are no link of any shape is as likely a hinge that no start has reached.
+        odds = alone if _shapely(slide, sight) else -UNDECIDED
     elif odds * by_costs < 0:
         # Points that are no part of a link of any shape would turn the answer round: they are as likely to know.
         return probabilities({"prismatic": 0.0, "revolute": float(np.clip(odds, -UNDECIDED, UNDECIDED))})
@@ -555,6 +559,12 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         # The votes are against what they should confirm: where most neighbourhoods are, whatever the few gain, leads.
         odds = float(np.copysign(UNDECIDED, most))
     return probabilities({"prismatic": 0.0, "revolute": odds})
+
+
+def _shapely(b: Bundle, sight: Sightings) -> bool:
+    """Whether nearly all points of the link are near each other."""
+    own = b.X if sight.link is None else b.X[sight.link]
+    return bool(np.mean(compact(own) & (own[:, 2] > 0)) > SHAPELY)
 
 
 def _cost_gain(one: Bundle, other: Bundle, sight: Sightings) -> float:

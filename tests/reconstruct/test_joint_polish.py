@@ -202,6 +202,15 @@ def test_what_few_tracks_gain_is_no_evidence(kind, seed):
     assert type_probabilities(best, s)[kind] > 0.9
 
 
+def test_a_slide_whose_points_are_no_link_is_not_sure():
+    """A small laptop was a sure slide of which a seventh of the points were far before and behind the others."""
+    best, s = strayed_small_motion("prismatic", 2)
+    assert type_probabilities(best, s)["prismatic"] > 0.9
+    far = np.where(np.arange(len(s.uv)) % 8 == 0, 12.0, 1.0)[:, None]
+    p = type_probabilities({kind: replace(b, X=far * b.X) for kind, b in best.items()}, s)
+    assert 0.4 < p["prismatic"] < 0.8
+
+
 @pytest.mark.parametrize(("most", "leads"), [(-0.2, "prismatic"), (0.2, "revolute")])
 def test_where_the_votes_are_against_the_odds_the_side_of_most_neighbourhoods_leads(most, leads, monkeypatch):
     """Blades and a drawer of some pixels were hinges so, the more frequent type; none of them is sure."""
