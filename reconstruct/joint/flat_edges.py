@@ -93,6 +93,12 @@ def _lever(length: np.ndarray) -> np.ndarray:
     return length / np.sqrt(12)
 
 
+def edge_of(slip: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """(N,) which edge each track is of; arguments as of :func:`lines_of`."""
+    first = slip[np.arange(len(slip)), reference]
+    return np.unique(np.column_stack([reference, first]), axis=0, return_inverse=True)[1].ravel()
+
+
 def lines_of(uv: np.ndarray, slip: np.ndarray, reference: np.ndarray, apart: float) -> tuple[Lines, np.ndarray]:
     """The edges that tracks are points of.
 
@@ -103,8 +109,7 @@ def lines_of(uv: np.ndarray, slip: np.ndarray, reference: np.ndarray, apart: flo
     Returns:
         E edges, and (N,) which of them each track is of.
     """
-    first = slip[np.arange(len(uv)), reference]
-    of = np.unique(np.column_stack([reference, first]), axis=0, return_inverse=True)[1].ravel()
+    of = edge_of(slip, reference)
     E, T = int(of.max(initial=-1)) + 1, uv.shape[1]
     middle, along, length = np.zeros((E, T, 2)), np.zeros((E, T, 2)), np.zeros((E, T))
     for e in range(E):

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruct.cues import Tracks
+from reconstruct.joint.flat_edges import edge_of
 from reconstruct.joint.models import JointFit, joint_transform
 from reconstruct.joint.paths import Paths, held
+from reconstruct.joint.polish import HOLDERS
 from reconstruct.joint.unseen.outline import MOST, SPACING_PX, WORTH, Outline
 from reconstruct.video import Video
 
@@ -25,8 +27,6 @@ FOLLOWS, RATHER = 0.25, 3.0
 where it would rest."""
 FEWEST = 2
 """Lines that an outline has at least."""
-HOLDERS = 3
-"""Tracks that hold two neighbouring states together."""
 STEPS, TOO_FAR = 6, 0.1
 """Of Gauss-Newton on a line's depths, and the largest one over what is changed."""
 
@@ -73,8 +73,7 @@ class Going:
         uv = np.concatenate([video.to_work(np.where(t.visible[..., None], t.uv, np.nan)) for t in both])
         slip = np.concatenate([np.zeros(t.uv.shape) if t.slip is None else t.slip for t in both])
         N = len(points.uv)
-        first = slip[np.arange(N, len(uv)), edges.reference]
-        line = np.unique(np.column_stack([edges.reference, first]), axis=0, return_inverse=True)[1].ravel()
+        line = edge_of(slip[N:], edges.reference)
         z = (fit.points @ C[:3, :3].T + C[:3, 3])[:, 2]
         near, far = np.quantile(z, [0.05, 0.95])
         size = float(np.linalg.norm(np.quantile(fit.points, 0.95, axis=0) - np.quantile(fit.points, 0.05, axis=0)))
