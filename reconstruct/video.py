@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import shutil
 import tempfile
@@ -27,6 +28,8 @@ LONGEST_GAP = 60.0
 """s; a longer one between two frames, far beyond the clip's usual spacing, is a broken time stamp."""
 FLAT_GREY = 2.0
 JUMP_GREY = 8.0
+RAMP_SECONDS, RAMP_GAIN, RAMP_TOTAL = 2.0, 0.01, np.log(2.0) / 2
+"""A picture that brightens or darkens from its start on by 1 % a frame, half a stop in all, 2 s at most, settles."""
 THUMB = 64
 
 
@@ -203,10 +206,12 @@ def choose_frames(time: np.ndarray) -> np.ndarray:
 
 
 def count_unsettled(thumbs: np.ndarray, time: np.ndarray) -> int:
-    """How many leading frames come before the picture's last jump within the first half second.
+    """How many leading frames come before the picture's last jump within the first half second, and the ramp after.
 
     A jump is a change of the mean picture between neighbours that is large in itself and against
     the clip's usual change: exposure hunting, a broken reference frame, a stale buffer.
+    A ramp is a gain of the whole picture that goes on from frame to frame (an exposure that settles):
+    bright things bloom with it, so that their edges move though nothing does.
 
     Args:
         thumbs: (T, h, w, 3) uint8 small frames.  time: (T,) s.
@@ -215,7 +220,21 @@ def count_unsettled(thumbs: np.ndarray, time: np.ndarray) -> int:
     limit = max(JUMP_GREY, 10.0 * float(np.median(change)))
     early = time[1:] - time[0] <= SETTLE_SECONDS
     jumps = np.flatnonzero((change > limit) & early)
-    return int(jumps[-1]) + 1 if len(jumps) else 0
+    first = int(jumps[-1]) + 1 if len(jumps) else 0
+    return first + _ramp(thumbs[first:], time[first:])
+
+
+def _ramp(thumbs: np.ndarray, time: np.ndarray) -> int:
+    """Length of the brightness's ramp at the start, frames; 0 where it is too small or too long to be one."""
+    gains: list[float] = []
+    grey = thumbs[time - time[0] <= RAMP_SECONDS].astype(np.float32).mean(axis=-1).reshape(-1, thumbs[0, ..., 0].size)
+    for before, after in itertools.pairwise(grey):
+        told = (np.minimum(before, after) > 8.0) & (np.maximum(before, after) < 240.0)
+        gains.append(float(np.median(np.log(after[told] / before[told]))) if told.any() else 0.0)
+        if len(gains) >= 3 and max(map(abs, gains[-3:])) < RAMP_GAIN:
+            total = abs(sum(gains[:-3]))
+            return len(gains) - 3 if total >= RAMP_TOTAL else 0
+    return 0
 
 
 def find_cut(frames: np.ndarray, thumbs: np.ndarray) -> int | None:
