@@ -23,6 +23,7 @@ from reconstruct.joint.polish import (
     residuals,
     robust_loss,
 )
+from reconstruct.joint.states import held_frames
 from reconstruct.joint.uncertainty import Spread, clusters
 
 REGION = 0.3
@@ -41,10 +42,12 @@ class Half:
 
     Attributes:
         tracks: (N,) bool, those it is fitted to.  bundle: the joint, with their points.
+        held: (T,) bool, the frames whose state enough of them agree on.
     """
 
     tracks: np.ndarray
     bundle: Bundle
+    held: np.ndarray
 
 
 def halves(b: Bundle, s: Sightings, seed: int = 0) -> tuple[Bundle, list[Half]]:
@@ -71,7 +74,7 @@ def halves(b: Bundle, s: Sightings, seed: int = 0) -> tuple[Bundle, list[Half]]:
         half, few = replace(b, X=b.X[tracks]), s.of(tracks)
         for scale in (WIDE, 1.0):
             half = polish(half, few, STEPS, scale * limit, sharpen=False)
-        out.append(Half(tracks, half))
+        out.append(Half(tracks, half, _held(half, few)))
         # The points of the whole are where the old joint wanted them: they are placed anew.
         whole = polish(place_points(replace(half, X=b.X * _scale(half, b, tracks)), s), s, LAST_STEPS, limit, False)
         best = min(best, whole, key=lambda x: _cost(x, s, limit))
@@ -87,14 +90,21 @@ def widened(sure: Spread, b: Bundle, several: list[Half]) -> Spread:
 
     Returns:
         Axis (deg), point and states (T,) (rad, units of the link's mean depth) with the larger standard deviation of
-        both; the rest is left.
+        both; the rest is left. Of a state only those halves speak that hold it: elsewhere theirs run off for nothing.
     """
     if len(several) < HALVES / 2:
         return sure
     off = [_off(half, b) for half in several]
     axis, point = (STUDENT * float(np.sqrt(np.mean([o[k] ** 2 for o in off]))) for k in (0, 1))
-    q = STUDENT * np.sqrt(np.mean([o[2] ** 2 for o in off], axis=0))
+    held = np.array([half.held for half in several])
+    q = STUDENT * np.sqrt(np.sum([o[2] ** 2 for o in off], axis=0, where=held) / np.maximum(held.sum(0), 1))
     return replace(sure, axis_deg=max(sure.axis_deg, axis), point=max(sure.point, point), q=np.maximum(sure.q, q))
+
+
+def _held(b: Bundle, s: Sightings) -> np.ndarray:
+    """(T,) bool: frames whose state tracks agree on, three of the five around among them; single ones are chance."""
+    held = held_frames(b, s)
+    return held & (np.convolve(held, np.ones(5), "same") >= 3)
 
 
 def _cost(b: Bundle, s: Sightings, limit: float) -> float:
@@ -109,18 +119,26 @@ def _scale(half: Bundle, b: Bundle, tracks: np.ndarray) -> float:
 
 
 def _off(half: Half, b: Bundle) -> tuple[float, float, np.ndarray]:
-    """By how much a half differs: axis, deg; its line across itself, link depths; (T,) states, rad or link depths."""
+    """By how much a half differs: axis, deg; its line across itself, link depths; (T,) states, rad or link depths.
+
+    States are relative to the first frame; of a half that does not see it they are taken relative to its own middle.
+    """
     one, two, unit = b.twist, half.bundle.twist, float(np.median(b.X[:, 2]))
     scale = _scale(half.bundle, b, half.tracks)
     axis, other = one.axis, two.axis
     along = float(axis @ other)
     turned = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(axis, other)), abs(along))))
     if b.kind == "prismatic":
-        return turned, 0.0, np.sign(along) * half.bundle.q / scale / unit - b.q / unit
+        return turned, 0.0, _moved(half, np.sign(along) * half.bundle.q / scale / unit - b.q / unit)
     middle = np.median(b.X, axis=0)
     foot = one.point + axis * (axis @ (middle - one.point))
     gap = two.point / scale - foot
     gap = gap + other * (other @ (middle - two.point / scale))
     gap = gap - axis * (axis @ gap)
     rate = [float(np.linalg.norm(t.curvature)) for t in (one, two)]
-    return turned, float(np.linalg.norm(gap)) / unit, np.sign(along) * rate[1] * half.bundle.q - rate[0] * b.q
+    q = _moved(half, np.sign(along) * rate[1] * half.bundle.q - rate[0] * b.q)
+    return turned, float(np.linalg.norm(gap)) / unit, q
+
+
+def _moved(half: Half, q: np.ndarray) -> np.ndarray:
+    return q if half.held[0] or not half.held.any() else q - np.median(q[half.held])
