@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from reconstruct.joint.paths import held as along_held
 from reconstruct.joint.polish import HOLDERS, ROBUST_SIGMAS, Bundle, Sightings, positions, residuals
@@ -32,8 +33,32 @@ def held_frames(b: Bundle, s: Sightings, share: float = HOLDING) -> np.ndarray:
         b: the joint.  s: its observations.  share: of the tracks in sight that have to agree, HOLDERS at least.
     """
     seen = s.seen if s.link is None else s.seen & s.link[:, None]
-    near = seen & (np.linalg.norm(residuals(b, s), axis=-1) < ROBUST_SIGMAS * max(b.sigma, 0.05))
-    return near.sum(0) >= np.maximum(HOLDERS, share * seen.sum(0))
+    return near_tracks(b, s).sum(0) >= np.maximum(HOLDERS, share * seen.sum(0))
+
+
+def near_tracks(b: Bundle, s: Sightings) -> np.ndarray:
+    """(N, T) bool: sightings of the link where the joint has them."""
+    near = s.seen & (np.linalg.norm(residuals(b, s), axis=-1) < ROBUST_SIGMAS * max(b.sigma, 0.05))
+    return near if s.link is None else near & s.link[:, None]
+
+
+def apart(b: Bundle, s: Sightings) -> np.ndarray:
+    """(T,) bool: frames whose state no chain of tracks holds to the first one's.
+
+    Points that other frames alone show turn about the axis with these frames' states as they like: HOLDERS tracks that
+    both show say how far, or nothing does. Where one or two strays do, a covariance calls it known.
+
+    Args:
+        b: the joint.  s: its observations.
+    """
+    near = near_tracks(b, s)
+    held = np.flatnonzero(near.sum(0) >= HOLDERS)
+    out = np.zeros(near.shape[1], bool)
+    if len(held):
+        shared = near[:, held].T.astype(np.int32) @ near[:, held].astype(np.int32)
+        part = connected_components(shared >= HOLDERS, directed=False)[1]
+        out[held] = part != part[0]
+    return out
 
 
 def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:

@@ -234,7 +234,7 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     if np.trace(robust) > np.trace(curvature):
         curvature = robust
     focal = float(np.sqrt(variance(np.eye(len(S))[G : G + 1])[0])) if s.focal_std > 0 else 0.0
-    q_std = np.sqrt(np.minimum(q_var, _widest(b) ** 2))
+    q_std = np.sqrt(np.minimum(q_var, widest(b) ** 2))
     q_std[0] = 0.0
     inflation = float(axis_var.sum() / max(plain, 1e-30))
     shown = frames_held(s, w)
@@ -243,6 +243,7 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     return Spread(float(np.degrees(np.sqrt(axis_var.sum()))), point, q_std, curvature, focal, inflation, stroke)
 
 
-def _widest(b: Bundle) -> float:
+def widest(b: Bundle) -> float:
+    """The whole stroke, rad or units of the link's mean depth."""
     span = max(np.ptp(b.q), 1e-9)
     return span if b.kind == "prismatic" else span * float(np.linalg.norm(b.twist.curvature))

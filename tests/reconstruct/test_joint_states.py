@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, frames_held, polish, positions, residuals
-from reconstruct.joint.states import found_again, held_frames, held_only, in_sight_only, with_states
+from reconstruct.joint.states import apart, found_again, held_frames, held_only, in_sight_only, with_states
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
 KINDS = ("revolute", "prismatic")
@@ -93,6 +95,49 @@ def test_where_a_moving_camera_has_lost_the_link_one_stray_does_not_carry_it_on(
     seen[link, since:] = True
     same, all_of_it = in_sight_only({kind: replace(b, q=truth.q)}, replace(both, seen=seen))
     assert all_of_it.seen.all() and same[kind].q is truth.q
+
+
+def in_two(s, seed, bridge, at=20):
+    """The sightings with half of the tracks in the frames before, half in those from `at` on, and some in both."""
+    order = np.random.default_rng(seed).permutation(len(s.seen))
+    half, seen = len(order) // 2, s.seen.copy()
+    seen[order[bridge:half], at:] = False
+    seen[order[half:], :at] = False
+    return replace(s, seen=seen, uv=np.where(seen[..., None], s.uv, 0.0)), order[:bridge]
+
+
+@given(st.sampled_from(KINDS), st.integers(0, 5), st.integers(0, 6))
+def test_three_tracks_hold_frames_together(kind, seed, bridge):
+    truth, s = scene(kind, seed)
+    s, _ = in_two(s, seed, bridge)
+    late = np.arange(40) >= 20
+    np.testing.assert_array_equal(apart(truth, s), late if bridge < 3 else np.zeros(40, bool))
+
+
+def test_tracks_that_stray_hold_nothing_together_and_frames_that_show_nothing_do_not_part():
+    truth, s = scene("revolute", 1)
+    seen = s.seen.copy()
+    seen[:, 12:17] = False  # a hand before all of it, the same tracks after
+    assert not apart(truth, replace(s, seen=seen)).any()
+    s, bridging = in_two(s, 1, 8)
+    uv = s.uv.copy()
+    uv[bridging[2:], 20:] += 30.0
+    assert apart(truth, replace(s, uv=uv)).sum() == 20
+
+
+def test_a_joint_states_the_stroke_for_what_two_strays_hold():
+    """Points before a door is on edge and after: two along a rim made it sure, 30 deg off."""
+    truth, s = scene("revolute", 2, points=80)
+    s, bridging = in_two(s, 2, 2)
+    uv = np.where(s.seen[..., None], s.uv, np.nan)
+    uv[bridging] = uv[bridging, :1] + 0.6 * (uv[bridging] - uv[bridging, :1])
+    done = finish({"revolute": [truth], "prismatic": [_slide(truth)]}, Paths(uv, None), np.arange(80), View(FOCAL))
+    turned = done.bundle.q * np.linalg.norm(done.bundle.twist.curvature)
+    right = truth.q * np.linalg.norm(truth.twist.curvature)
+    late = np.arange(40) >= 20
+    assert (done.spread.q[late] >= 0.9 * np.ptp(turned)).all()
+    assert (np.abs(turned - right)[late] <= 1.96 * done.spread.q[late]).all()
+    assert done.spread.q[~late].max() < 0.1
 
 
 def test_a_state_before_a_lost_camera_is_no_part_of_the_stroke():
