@@ -78,6 +78,17 @@ class StageBars:
             self.console.print(f"{self.name:<10} {seconds:6.1f} s  {note}".rstrip())
 
 
+def _how_to_make(asset: Asset, **options: str) -> str:
+    """The line of Python that makes the asset's environment: by its id where that is found, else by its folder."""
+    from taa_envs import registry
+
+    more = "".join(f", {name}={value!r}" for name, value in options.items())
+    found = registry.find_assets().get(asset.id)
+    if found is not None and found.resolve() == asset.path.resolve():
+        return f"gymnasium.make({f'TAA/{asset.id}'!r}{more})"
+    return f"taa_envs.env.ArticulationEnv({str(asset.path)!r}{more})"
+
+
 def reconstruct(video: Path, asset_id: str, scene: Path | None, out: Path | None, focal: float | None,
                 providers: dict[str, str], overwrite: bool, seed: int) -> Outcome:  # fmt: skip
     from reconstruct.pipeline import reconstruct as run
@@ -96,7 +107,7 @@ def reconstruct(video: Path, asset_id: str, scene: Path | None, out: Path | None
             _table("open-loop replay through contact", replay_rows(result.replay))
         print(f"asset   {result.asset.path}")
         print(f"report  {result.asset.path / 'report.html'}")
-        print(f'use     gymnasium.make("TAA/{asset_id}")')
+        print(f"use     {_how_to_make(result.asset)}")
 
     return Outcome(result.as_dict(), show, result.error)
 
@@ -221,7 +232,8 @@ def replay(asset_id: str, hand: str, video: Path | None, refining: bool, referen
             notes.append("no correction within the stated uncertainty is better than the demonstration itself")
         if not found.stated:
             notes.append("the asset does not state how uncertain its hand is; common deviations were assumed")
-        notes.append(f'use it: gymnasium.make("TAA/{asset_id}", hand="{hand}", reference="refined")')
+        there = dataclasses.replace(asset, path=where)
+        notes.append(f"use it: {_how_to_make(there, hand=hand, reference='refined')}")
     else:
         asset = with_reference(asset, reference, hand)
         result = run(asset, hand)

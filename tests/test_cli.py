@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -226,3 +227,26 @@ def test_as_a_process(assets):
 def test_importing_the_command_is_light():
     code = "import sys, taa_envs.cli; sys.exit(sum(m in sys.modules for m in ('torch', 'cv2', 'mujoco', 'rich')))"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
+def test_the_line_that_makes_a_refined_asset_is_python_that_does(taa, assets, tmp_path):
+    """By its id where it is found by that, else by its folder: a copy elsewhere is not TAA/<id>."""
+    import gymnasium
+
+    import taa_envs.env
+
+    def line(*args: object) -> str:
+        code, out, err = taa("replay", *args, "--refine", "--seconds", 1)
+        assert code == 0, err
+        joined = "".join(out.split("\n"))
+        return joined[joined.index("note: use it: ") + len("note: use it: ") :].split(")")[0] + ")"
+
+    assert line("door", "--out", tmp_path / "copies").startswith("taa_envs.env.ArticulationEnv(")
+    shutil.copytree(assets / "door", tmp_path / "elsewhere" / "door")
+    for asked, by_id in (("door", True), (tmp_path / "elsewhere" / "door", False)):
+        words = line(asked)
+        assert words.startswith("gymnasium.make('TAA/door'") == by_id
+        taa_envs.register_assets()
+        env = eval(words, {"gymnasium": gymnasium, "taa_envs": taa_envs})
+        assert env.unwrapped.asset.id == "door"
+        env.close()

@@ -8,6 +8,7 @@ itself only, but with the few points enough.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -40,7 +41,8 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
 
     Not where a body that is carried freely refutes it: a few edges of that follow some hinge. Where it is refused they
     are asked without all that may be a shadow, and a sure answer counts; else, and where the axis is open, known to
-    VAGUE_DEG or worse by points alone, without the edges of shadows: a sure answer counts that knows it better. Else
+    VAGUE_DEG or worse by points alone, without the edges of shadows: a sure answer counts that knows it better; either
+    unless a probable plate contradicts it that more points follow. Else
     the part is asked as a plate that turns in its plane, by its edges first. That counts if it knows the axis better or
     is probable by itself. Else what was found counts, unless the most probable plate contradicts it. Where a joint is
     doubtful though its axis is known, a plate counts that contradicts it, is probable, and explains nearly all edges.
@@ -63,14 +65,24 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
     if not refused and not is_open(fit):
         return _unless_plainly_a_plate(fit, flat(uncast, edges), points)
     words = SHOW_NONE if refused else LEAVE_OPEN
+
+    @functools.cache
+    def plate_and_joint() -> tuple[FlatFit | None, JointFit | None]:
+        plate = flat(uncast, edges)
+        return plate, None if plate is None else _answer(plate.fit, points)
+
+    def sure(found: JointFit) -> JointFit:
+        plate, turned = plate_and_joint()
+        rather = plate is not None and turned is not None and _rather_a_plate(found, plate, turned)
+        return doubtful(turned if rather and turned is not None else found, words)
+
     first = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), points) if refused else None
     if first is not None and first.verdict == "ok":
-        return doubtful(first, words)
+        return sure(first)
     found = _answer(ask(_joined(uncast, edges)), points) or first
     if found is not None and found.verdict == "ok" and (refused or alone_deg(found) < alone_deg(fit)):
-        return doubtful(found, words)
-    plate = flat(uncast, edges)
-    turned = None if plate is None else _answer(plate.fit, points)
+        return sure(found)
+    plate, turned = plate_and_joint()
     better = found is not None and (refused or alone_deg(found) < alone_deg(fit))
     if plate is not None and turned is not None:
         known = alone_deg(turned) < (PLATE_DEG if refused else alone_deg(fit))
@@ -78,6 +90,16 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
             return doubtful(turned, words)
         better = better and found is not None and apart_deg(found, turned) < NEAR_DEG
     return doubtful(found, words) if found is not None and better else fit
+
+
+def _rather_a_plate(found: JointFit, plate: FlatFit, turned: JointFit) -> bool:
+    """Whether a probable plate contradicts what points and edges are sure of, and more of the points follow it."""
+    apart = found.type != turned.type or apart_deg(found, turned) >= NEAR_DEG
+    return apart and plate.probability > PROBABLE and _count(turned) > _count(found)
+
+
+def _count(fit: JointFit) -> int:
+    return 0 if fit.point_track is None else len(fit.point_track)
 
 
 def _unless_plainly_a_plate(fit: JointFit, plate: FlatFit | None, points: int) -> JointFit:
