@@ -84,7 +84,7 @@ def run(name: str, folder: Path) -> dict:
         folder: where assets and rendered clips are written.
 
     Returns:
-        One row: clip, truth, verdict, type, errors, range (deg or m), replay, seconds, error.
+        One row: clip, truth, verdict, type, errors, range (deg or m), replay, notes, seconds, error.
     """
     from reconstruct.errors import TaaError
     from reconstruct.pipeline import reconstruct
@@ -108,7 +108,8 @@ def run(name: str, folder: Path) -> dict:
         return {**row, "verdict": "error", "error": str(error), "seconds": time.monotonic() - begin}
     joint = result["joint"]
     row |= {"verdict": joint["verdict"], "type": joint.get("type"), "reason": joint["reason"],
-            "replay": result["replay"], "asset": result["asset"], "seconds": time.monotonic() - begin}  # fmt: skip
+            "replay": result["replay"], "asset": result["asset"], "notes": result["notes"],
+            "seconds": time.monotonic() - begin}  # fmt: skip
     if joint.get("q") and kind:
         span = float(np.ptp(joint["q"]))
         row["range"] = float(np.degrees(span)) if joint["type"] != "prismatic" else span

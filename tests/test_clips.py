@@ -15,6 +15,10 @@ PRESENT = annotations()
 SLIPPERY = ("dishwasher.mp4",)
 """Where the landmarks' last digits, which differ between machines, decide whether the grip slips (docs/limits.md)."""
 
+OPEN = ("stapler_fold.mp4", "suitcase.mp4")
+"""Sure or ambiguous by the machine's last digits: the stapler's axis is held to 9 to 11 deg, where 10 are asked; the
+suitcase's handle is a slide with p 0.73 to 1.00."""
+
 
 def real(name):
     return pytest.param(
@@ -27,8 +31,7 @@ def real(name):
 )
 def test_real_clip_gives_the_annotated_joint_and_a_replay(name, tmp_path):
     truth, row = PRESENT[name], run(name, tmp_path)
-    # The stapler's axis is held to 9 to 11 deg, by the machine's last digits; beyond 10 that is ambiguous.
-    assert row["verdict"] == "ok" or (name == "stapler_fold.mp4" and row["verdict"] == "ambiguous"), row
+    assert row["verdict"] == "ok" or (name in OPEN and row["verdict"] == "ambiguous"), row
     assert row["type"] == truth["joint"]
     assert row.get("angle_deg", 0) < 8
     assert row.get("distance", 0) < 0.04
@@ -39,6 +42,7 @@ def test_real_clip_gives_the_annotated_joint_and_a_replay(name, tmp_path):
     if name not in SLIPPERY:
         assert row["replay"]["joint_progress"] >= 0.7
     elif row["replay"]["joint_progress"] < 0.7:
+        assert row["replay"]["joint_progress"] > 0.5 or any("--refine" in note for note in row["notes"])
         # A hand that holds has to be within what its placement leaves open.
         found = refine(load_asset(row["asset"]), seconds=60)
         assert found.after.joint_progress >= 0.7

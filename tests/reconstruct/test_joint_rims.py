@@ -171,13 +171,24 @@ def test_what_the_likeliest_plate_contradicts_does_not_count(agrees):
     assert not agrees or out.std["axis_deg"] == FACTOR * 12.0
 
 
-def test_a_sure_joint_of_edges_counts_before_a_plate():
-    def never_flat(points: Tracks, rims: Tracks) -> None:
-        raise AssertionError("a plate was asked for")
-
+@pytest.mark.parametrize("refused", [True, False])
+@pytest.mark.parametrize(("followers", "probability", "agrees", "counts"), [
+    (12, 0.9, False, True),
+    (12, 0.7, False, False),
+    (8, 0.9, False, False),
+    (12, 0.9, True, False),
+])  # fmt: skip
+def test_a_sure_joint_of_edges_gives_way_to_a_probable_plate_that_more_points_follow(
+    refused, followers, probability, agrees, counts
+):
+    turned = joint("ok", np.concatenate([np.arange(followers), np.arange(POINTS, POINTS + EDGES)]), 30.0)
+    plate = FlatFit(turned if agrees else replace(turned, axis=np.array([1.0, 0, 0])), probability, 0.7)
+    fit = REFUSED if refused else joint("ambiguous", BOTH_IDS, 20.0)
     ask = Asked(joint("ok", OTHER_IDS, 6.0))
-    out = unless_rims_tell(joint("ambiguous", BOTH_IDS, 20.0), VIDEO, tracks(POINTS, 20.0), edges, ask, never_flat)
-    assert out.std["axis_deg"] == FACTOR * 6.0
+    out = unless_rims_tell(fit, VIDEO, tracks(POINTS, 20.0), edges, ask, lambda points, rims: plate)
+    assert out.verdict == "ambiguous" and len(ask.of) == 1
+    assert out.std["axis_deg"] == FACTOR * (30.0 if counts else 6.0)
+    assert len(out.point_track) == (followers if counts else len(POINT_IDS))
 
 
 @pytest.mark.parametrize(("probability", "share", "agrees", "counts"), [
