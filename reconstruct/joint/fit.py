@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.answers import better_known
+from reconstruct.joint.answers import better_known, doubtful
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import free_motion
@@ -219,7 +219,7 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         return None
     done, note = _better_held(done, pictures, "; the motion is slight")
     fit = result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
-    return fit if together else replace(fit, verdict="ambiguous", reason=f"{fit.reason}; {STRAYS}")
+    return fit if together else doubtful(fit, STRAYS)
 
 
 def _better_held(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:

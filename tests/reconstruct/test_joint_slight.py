@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reconstruct.joint import fit as fitting
-from reconstruct.joint.answers import better_known
+from reconstruct.joint.answers import FACTOR, better_known
 from reconstruct.joint.finish import View
 from reconstruct.joint.flow import flow_of
 from reconstruct.joint.paths import Paths
@@ -99,6 +99,22 @@ def test_a_joint_of_few_tracks_gives_way_to_one_of_many(monkeypatch, said, std, 
     assert ("the motion is slight" in fit.reason) == (fit.inliers > 100) == gives_way
     away = np.degrees(np.arccos(min(1.0, abs((fit.T_camera_world[:3, :3] @ fit.axis) @ scene.axis))))
     assert away < 2
+
+
+def test_a_joint_that_most_of_what_moves_does_not_follow_is_stated_as_doubtful(monkeypatch):
+    """A hinge with p = 1.00, stated to 8 deg, was 87 deg off: of what left its place less than half went with it."""
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.02, 0.5], [-0.3, 0.3], [-0.005, 0.005]], 0.3,
+                       points=120, impostors=10, noise=0.3)  # fmt: skip
+    refused = fitting._Draw(fitting.JointFit("refused", "too few tracks"), 0.0, np.nan)
+    monkeypatch.setattr(fitting, "_one_draw", lambda *_: refused)
+    sure = fitting.fit_joint(scene.video, scene.tracks, joint_scenes.FOCAL, 0)
+    assert sure.verdict == "ok" and sure.type_probability["revolute"] > 0.9
+    asked = fitting.slight_motion
+    monkeypatch.setattr(fitting, "slight_motion", lambda *args: (*asked(*args)[:2], False))
+    fit = fitting.fit_joint(scene.video, scene.tracks, joint_scenes.FOCAL, 0)
+    assert fit.verdict == "ambiguous" and fit.reason.startswith(fitting.STRAYS)
+    assert fit.type_probability["revolute"] < 0.9
+    assert fit.std["axis_deg"] == pytest.approx(FACTOR * sure.std["axis_deg"])
 
 
 def test_more_tracks_count_only_with_most_of_the_others_among_them():
