@@ -17,6 +17,7 @@ import numpy as np
 from reconstruct.joint.finish import Finished
 from reconstruct.joint.photometric import LEAST_INVERSE, STEPS, Adjustment, Pictures, Reader, Surface, spread_of
 from reconstruct.joint.polish import HOLDERS, Bundle, Sightings, link_noise, place_points, positions, residuals
+from reconstruct.joint.states import unlinked
 from reconstruct.joint.uncertainty import compact
 
 WORTH_DEG = 0.5
@@ -107,10 +108,10 @@ def by_faces(done: Finished, pictures: Pictures, seed: int = 0) -> Finished:
     if sigma > max(AWAY * b.sigma, AWAY_PX):
         return done
     out, kept = _onto_faces(replace(out, sigma=sigma), sight, frames[frame], s, grid, face)
-    # A state that is far off when the face is first drawn is not found: where no tracks show it they say how well it
-    # is known, and so of all of them where that is the first, from which they are measured.
+    # A state that is far off when the face is first drawn is not found: where no tracks hold it to the first they say
+    # how well it is known, and so of all of them where no tracks show that, from which they are measured.
     unseen = sight.seen.sum(0) < HOLDERS
-    by_tracks = np.where(unseen | unseen[0], done.spread.q, 0.0)
+    by_tracks = np.where(unseen | unseen[0] | unlinked(b, sight), done.spread.q, 0.0)
     sure = replace(sure, q=np.maximum(np.interp(every, frames, sure.q), by_tracks))
     return replace(done, bundle=replace(out, X=out.X[kept]), sight=sight.of(kept), members=done.members[kept],
                    spread=sure, once=None)  # fmt: skip

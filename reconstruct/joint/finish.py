@@ -27,7 +27,7 @@ from reconstruct.joint.polish import (
     robust_loss,
     track_costs,
 )
-from reconstruct.joint.states import apart, held_only, in_sight_only
+from reconstruct.joint.states import held_only, in_sight_only
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import (
     Spread,
@@ -38,7 +38,6 @@ from reconstruct.joint.uncertainty import (
     shared_weights,
     spread,
     strayed,
-    widest,
 )
 
 MIN_COMMON = 8
@@ -324,7 +323,7 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
     if others is None:
         probability = type_probabilities(best, s)
         last = best[_winner(probability)]
-        return last, last, _unlinked(spread(last, s), last, s), probability, None
+        return last, last, spread(last, s), probability, None
 
     def again(kind: str) -> list[Bundle]:
         return [_refitted(b, best[kind], s) for b in others.get(kind, [])]
@@ -346,13 +345,8 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
     every = [polish(b, clean) for b in (better, *other)]
     last = cheapest(every, clean)
     # Halves scatter with the strays in them: what misleads is not always told from the link.
-    sure = _unlinked(widened(spread(last, clean), better, several), last, clean)
+    sure = widened(spread(last, clean), better, several)
     return once, last, sure, probability, _rival(last, every, clean)
-
-
-def _unlinked(sure: Spread, b: Bundle, s: Sightings) -> Spread:
-    """The uncertainty with the whole stroke for states that no chain of tracks holds to the first one."""
-    return replace(sure, q=np.where(apart(b, s), np.maximum(sure.q, widest(b)), sure.q))
 
 
 def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sightings:

@@ -42,7 +42,7 @@ def near_tracks(b: Bundle, s: Sightings) -> np.ndarray:
     return near if s.link is None else near & s.link[:, None]
 
 
-def apart(b: Bundle, s: Sightings) -> np.ndarray:
+def unlinked(b: Bundle, s: Sightings) -> np.ndarray:
     """(T,) bool: frames whose state no chain of tracks holds to the first one's.
 
     Points that other frames alone show turn about the axis with these frames' states as they like: HOLDERS tracks that
@@ -55,7 +55,7 @@ def apart(b: Bundle, s: Sightings) -> np.ndarray:
     held = np.flatnonzero(near.sum(0) >= HOLDERS)
     out = np.zeros(near.shape[1], bool)
     if len(held):
-        shared = near[:, held].T.astype(np.int32) @ near[:, held].astype(np.int32)
+        shared = near[:, held].T.astype(np.float32) @ near[:, held].astype(np.float32)
         part = connected_components(shared >= HOLDERS, directed=False)[1]
         out[held] = part != part[0]
     return out

@@ -23,6 +23,7 @@ from reconstruct.joint.polish import (
     robust_loss,
 )
 from reconstruct.joint.shape import Flat
+from reconstruct.joint.states import unlinked
 
 CELL = 0.06
 """Edge of a cluster over the link's diagonal."""
@@ -34,7 +35,8 @@ class Spread:
 
     Attributes:
         axis_deg: of the axis direction.  point: of the axis line across itself, in units of the link's mean depth.
-        q: (T,) of the states, rad or units of the mean depth.
+        q: (T,) of the states, rad or units of the mean depth; the whole stroke where no chain of tracks holds one to
+            that of the first frame.
         curvature: (3, 3) of the twist's curvature.  log_focal: of the focal length's logarithm.
         inflation: of the axis' variance over that of white noise.
         stroke: the stroke over its standard deviation, between the ends that tracks hold. States are relative to the
@@ -234,7 +236,7 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     if np.trace(robust) > np.trace(curvature):
         curvature = robust
     focal = float(np.sqrt(variance(np.eye(len(S))[G : G + 1])[0])) if s.focal_std > 0 else 0.0
-    q_std = np.sqrt(np.minimum(q_var, widest(b) ** 2))
+    q_std = np.where(unlinked(b, s), _widest(b), np.sqrt(np.minimum(q_var, _widest(b) ** 2)))
     q_std[0] = 0.0
     inflation = float(axis_var.sum() / max(plain, 1e-30))
     shown = frames_held(s, w)
@@ -243,7 +245,6 @@ def spread(b: Bundle, s: Sightings) -> Spread:
     return Spread(float(np.degrees(np.sqrt(axis_var.sum()))), point, q_std, curvature, focal, inflation, stroke)
 
 
-def widest(b: Bundle) -> float:
-    """The whole stroke, rad or units of the link's mean depth."""
+def _widest(b: Bundle) -> float:
     span = max(np.ptp(b.q), 1e-9)
     return span if b.kind == "prismatic" else span * float(np.linalg.norm(b.twist.curvature))

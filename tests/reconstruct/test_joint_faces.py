@@ -235,6 +235,24 @@ def test_faces_do_not_know_the_states_that_no_track_shows():
     assert by_faces(done, plate.pictures).spread.q.max() < 0.1
 
 
+@pytest.mark.slow
+def test_faces_do_not_know_the_states_that_no_track_links_to_the_first():
+    """Half of the tracks end where the others begin: by how far the link turns in between they do not say."""
+    plate = film(0, fine=5.0)
+    done = by_tracks(plate, 0)
+    seen, cut = done.sight.seen.copy(), T // 2
+    seen[::2, cut:] = False
+    seen[1::2, :cut] = False
+    sight = replace(done.sight, seen=seen)
+    sure = replace(spread(done.bundle, sight), axis_deg=5.0)
+    late, stroke = np.arange(T) >= cut, float(np.ptp(plate.q))
+    assert sure.q[late].min() > 0.9 * stroke
+    mended = by_faces(replace(done, sight=sight, spread=sure), plate.pictures)
+    assert mended.bundle is not done.bundle
+    assert mended.spread.q[late].min() > 0.9 * stroke
+    assert mended.spread.q[~late].max() < 0.1
+
+
 def test_pictures_that_show_nothing_change_nothing():
     plate = film(0)
     done = by_tracks(plate, 0)

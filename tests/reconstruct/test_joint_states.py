@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reconstruct.joint.finish import View, finish
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, frames_held, polish, positions, residuals
-from reconstruct.joint.states import apart, found_again, held_frames, held_only, in_sight_only, with_states
+from reconstruct.joint.states import found_again, held_frames, held_only, in_sight_only, unlinked, with_states
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
 KINDS = ("revolute", "prismatic")
@@ -111,18 +111,18 @@ def test_three_tracks_hold_frames_together(kind, seed, bridge):
     truth, s = scene(kind, seed)
     s, _ = in_two(s, seed, bridge)
     late = np.arange(40) >= 20
-    np.testing.assert_array_equal(apart(truth, s), late if bridge < 3 else np.zeros(40, bool))
+    np.testing.assert_array_equal(unlinked(truth, s), late if bridge < 3 else np.zeros(40, bool))
 
 
 def test_tracks_that_stray_hold_nothing_together_and_frames_that_show_nothing_do_not_part():
     truth, s = scene("revolute", 1)
     seen = s.seen.copy()
     seen[:, 12:17] = False  # a hand before all of it, the same tracks after
-    assert not apart(truth, replace(s, seen=seen)).any()
+    assert not unlinked(truth, replace(s, seen=seen)).any()
     s, bridging = in_two(s, 1, 8)
     uv = s.uv.copy()
     uv[bridging[2:], 20:] += 30.0
-    assert apart(truth, replace(s, uv=uv)).sum() == 20
+    assert unlinked(truth, replace(s, uv=uv)).sum() == 20
 
 
 def test_a_joint_states_the_stroke_for_what_two_strays_hold():
