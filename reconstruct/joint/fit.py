@@ -62,6 +62,9 @@ NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each 
 APART = "the camera moves, and hardly any frame shows the scene and the part together"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 STRAYS = "most of what leaves its place does not follow it"
+ANY_DEG = float(np.degrees(np.sqrt(np.pi - 2)))
+"""Root of the mean square angle between an axis and one at random. Three such answers from pixels were 50 deg and more
+off, stated to 8 to 9."""
 ALONE = "all that is followed moves as one body: the camera may go round it as well as the part may turn"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""
@@ -219,7 +222,10 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         return None
     done, note = _better_held(done, pictures, "; the motion is slight")
     fit = result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
-    return fit if together else doubtful(fit, STRAYS)
+    if together:
+        return fit
+    fit = doubtful(fit, STRAYS)
+    return replace(fit, std={**fit.std, "axis_deg": max(fit.std["axis_deg"], ANY_DEG)}, alone_deg=None)
 
 
 def _better_held(done: Finished, pictures: Pictures | None, note: str) -> tuple[Finished, str]:
