@@ -597,8 +597,8 @@ def _build(id: str, scene: Path | None, final: Path, overwrite: bool, seed: int,
         if result.joint_progress < 0.5 and result.contact_fraction < 0.5:
             notes.append("contact does not drive the part in the replay: see the table of the replay")
         if result.joint_progress < 0.5 and reference.contact.any():
-            notes.append(f"the grip slips off or misses: `taa replay {id} --refine` looks for one that holds, within "
-                         "what the hand's placement leaves open")  # fmt: skip
+            notes.append("the grip slips off or misses: `taa replay --refine` looks for one that holds, within what "
+                         "the hand's placement leaves open")  # fmt: skip
         stages.run("report", lambda: add_report(asset, video, hands, tracks, fit, masks, geometry, reference, result,
                                                 notes, stages.seconds), keep=False)  # fmt: skip
     asset = load_asset(final, check_model=False)

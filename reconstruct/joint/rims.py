@@ -73,8 +73,9 @@ def unless_rims_tell(fit: JointFit, video: Video, tracks: Tracks, rims: Callable
 
     def sure(found: JointFit) -> JointFit:
         plate, turned = plate_and_joint()
-        rather = plate is not None and turned is not None and _rather_a_plate(found, plate, turned)
-        return doubtful(turned if rather and turned is not None else found, words)
+        if plate is not None and turned is not None and _rather_a_plate(found, plate, turned):
+            return doubtful(turned, words)
+        return doubtful(found, words)
 
     first = _answer(ask(_joined(without(tracks, maybe_shadows(video, tracks)), edges)), points) if refused else None
     if first is not None and first.verdict == "ok":
