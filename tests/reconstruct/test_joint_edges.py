@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reconstruct.cues import Hands, ProviderInfo
-from reconstruct.joint.edges import on_one_edge, unless_one_edge
+from reconstruct.joint.answers import FACTOR
+from reconstruct.joint.edges import on_one_edge, on_parallels, unless_one_edge
 from reconstruct.joint.models import JointFit
 from reconstruct.pipeline import joint_off_the_arm
 from tests.reconstruct.joint_scenes import made, make_scene
@@ -77,3 +78,39 @@ def test_what_an_edge_alone_follows_is_no_sure_joint(found, turn, verdict, type_
     monkeypatch.setattr("reconstruct.joint.fit.fit_joint", lambda *_, **__: next(answers))
     nobody = Hands((), None, ProviderInfo("made", "0", "Apache-2.0"))
     assert joint_off_the_arm(scene.video, tracks, nobody, None, 0, lambda _: None).reason.startswith(words)
+
+
+def sliding(scene, uv, angle, length=0.98):
+    """Tracks that slide along edges at these angles (N,), rad, either way."""
+    slip = length * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None] * np.ones((1, uv.shape[1], 1))
+    slip[::2] *= -1
+    return replace(with_places(scene, uv), slip=slip.astype(np.float32))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0, np.pi), st.floats(0, 1), st.integers(0, 9))
+def test_parallel_edges_are_told_from_edges_of_two_directions_and_from_corners(angle, other, seed):
+    scene, rng = door(), np.random.default_rng(seed)
+    uv = rng.uniform(100, 400, (100, 1, 2)) + np.zeros((1, len(scene.video), 1))
+    ids, angles = np.arange(100), angle + np.radians(rng.uniform(-4, 4, 100))
+    assert on_parallels(sliding(scene, uv, angles), ids)
+    assert not on_parallels(sliding(scene, uv, angles, 0.5), ids)
+    assert not on_parallels(with_places(scene, uv), ids)
+    few = int(50 * other)
+    turned = np.where(ids < few, angles + np.pi / 2, angles)
+    assert on_parallels(sliding(scene, uv, turned), ids) == (few <= 10)
+    assert on_parallels(sliding(scene, uv, turned), ids[few:])
+
+
+def test_what_parallel_edges_alone_follow_is_no_sure_joint():
+    scene = door()
+    uv = np.random.default_rng(0).uniform(100, 300, (120, 1, 2)) + np.arange(len(scene.video))[None, :, None]
+    tracks = sliding(scene, uv, np.where(np.arange(120) < 40, 0.3, np.linspace(0, np.pi, 120)))
+    first, other = made("ok", 0.0, 0.1, np.arange(40)), made("ok", 70.0, 0.1, np.arange(40, 120))
+    fit = unless_one_edge(first, scene.video, tracks, lambda some: other)
+    assert fit.verdict == "ambiguous" and fit.axis is other.axis
+    assert fit.reason == f"without the tracks on parallel edges, {other.reason}"
+    fit = unless_one_edge(first, scene.video, tracks, lambda some: JointFit("refused", "nothing moves"))
+    assert fit.verdict == "ambiguous" and fit.reason.startswith("all tracks that agree slide along parallel edges")
+    assert fit.std["axis_deg"] == FACTOR * first.std["axis_deg"]
+    assert unless_one_edge(other, scene.video, tracks, lambda some: first) is other
