@@ -29,7 +29,7 @@ ROUNDS = 3
 """Fits of a line, as strays beside it turn it."""
 ALONG, ASIDE_DEG = 0.9, 10.0
 """Length of a sighting's slip from which on it slides along an edge as it will (it is five times worse held along than
-across), and how far off the others' an edge's direction may be to be the same. Of 44 sure joints of rendered films one
+across), and how far off the others' an edge's direction may be to be the same. Of 43 sure joints of rendered films one
 has SHARE of such, 37 deg off, the others 0.71 at most; nearly all are right."""
 ONE_EDGE = "all tracks that agree lie on one straight edge, of which only the way across is seen"
 PARALLELS = "all tracks that agree slide along parallel edges, of which only the way across is seen"
