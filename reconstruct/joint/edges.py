@@ -66,7 +66,11 @@ def _edges_alone(video: Video, tracks: Tracks, ids: np.ndarray) -> str:
 
 
 def on_parallels(tracks: Tracks, ids: np.ndarray) -> bool:
-    """Whether tracks (n,) slide along edges that go one way in each picture."""
+    """Whether tracks slide along edges that go one way in each picture.
+
+    Args:
+        ids: (n,) indices of the tracks.
+    """
     if tracks.slip is None or not tracks.visible[ids].any():
         return False
     slip, seen = tracks.slip[ids], tracks.visible[ids]

@@ -64,7 +64,7 @@ NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 STRAYS = "most of what leaves its place does not follow it"
 ANY_DEG = float(np.degrees(np.sqrt(np.pi - 2)))
 """Root of the mean square angle between an axis and one at random. Three such answers from pixels were 50 deg and more
-off, stated to 8 to 9."""
+off, stated to 8 to 10."""
 ALONE = "all that is followed moves as one body: the camera may go round it as well as the part may turn"
 DEFAULT_FOCAL = 0.8
 """Prior mean over the image's long side: phones and webcams lie between 0.65 and 0.95."""

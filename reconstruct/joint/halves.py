@@ -141,4 +141,5 @@ def _off(half: Half, b: Bundle) -> tuple[float, float, np.ndarray]:
 
 
 def _moved(half: Half, q: np.ndarray) -> np.ndarray:
+    """(T,) by how much a half's states are off, relative to the first, or to their middle where that is not held."""
     return q if half.held[0] or not half.held.any() else q - np.median(q[half.held])
