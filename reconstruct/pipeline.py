@@ -325,7 +325,7 @@ def look(video: Video, scene: Path | None, focal: float | None, seed: int, stage
 
 def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float | None, seed: int,
                       progress: Callable[[float], None], margin_px: int | None = None) -> JointFit:  # fmt: skip
-    """The joint without depth, from the tracks that are on no forearm and on no shadow's edge.
+    """The joint without depth, from the tracks that go somewhere and are on no forearm and on no shadow's edge.
 
     Sleeves often have more tracks than the part, and go nearly as it goes. Where nothing is found without them and
     they were many, the wedge of an arm may have held the part: then all tracks are asked, and a joint that is not
@@ -344,12 +344,14 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     from reconstruct.joint.flat_fit import FlatFit, fit_flat
     from reconstruct.joint.handling import unless_carried
     from reconstruct.joint.rims import unless_rims_tell
-    from reconstruct.joint.shadows import off_shadows, unless_a_shadow
+    from reconstruct.joint.shadows import off_shadows, unless_a_shadow, without
     from reconstruct.joint.unseen import with_unseen_states
+    from reconstruct.joint.wander import wandering
     from reconstruct.providers.edge_tracks import all_segments, edge_tracks
     from reconstruct.providers.lk_tracks import MARGIN_PX, pictures_of
 
     pictures = pictures_of(video, hands, MARGIN_PX if margin_px is None else margin_px)
+    tracks = without(tracks, wandering(video, tracks))
     arm = on_forearm(tracks, hands)
     share = float(np.mean(arm[moving])) if len(moving := moving_tracks(video, tracks)) else 0.0
     rest = replace(tracks, visible=tracks.visible & ~arm[:, None]) if share > 0 else tracks

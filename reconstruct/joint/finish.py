@@ -15,6 +15,7 @@ from reconstruct.joint.halves import halves, widened
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, majority, probabilities, tempered, votes
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import (
+    HOLDERS,
     ROBUST_SIGMAS,
     Bundle,
     Sightings,
@@ -207,7 +208,8 @@ class View:
 Starts = Mapping[str, Sequence[tuple[State, Observations] | Bundle]]
 
 
-def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Still | None = None) -> Finished:
+def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Still | None = None,
+           refuted: str | None = None) -> Finished:  # fmt: skip
     """Polish every type on the same tracks and decide between them.
 
     Args:
@@ -218,6 +220,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         view: focal length and camera.
         still: the resting scene, where the camera moves and its path in `view` is but an estimate: it is refined
             together with the joint, whose uncertainty then holds the camera's.
+        refuted: a type that is out of the question, however probable it is beside the others.
 
     Raises:
         NoLink: fewer than MIN_COMMON points make sense as those of one link.
@@ -226,7 +229,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     some = _spread_out(T, MOST_FRAMES if still is None else COARSE_FRAMES)
     pick = _spread_out(len(ids), MOST_TRACKS)
     # Until the errors are known they are taken to last: a focal length's prior has to hold against a few strays.
-    sight = view.sightings(paths[ids[pick]], some, lasting=100.0)
+    sight = _held_frames_only(view.sightings(paths[ids[pick]], some, lasting=100.0))
     best: dict[str, Bundle] = {}
     others: dict[str, list[Bundle]] = {}
     for kind, several in starts.items():
@@ -254,7 +257,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best, sight = in_sight_only(*_together(_across_kinds(best, sight), sight, paths, still, view))
     sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
-    probability = type_probabilities(best, sight)
+    probability = _left(type_probabilities(best, sight), refuted)
     if probability.get("screw", 1.0) < NO_SCREW:
         del best["screw"]
 
@@ -268,7 +271,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     like = view.sightings(paths[members], some, max(1.0, sight.lasting * len(some) / len(sight.frames)))
     more, X = followers(lead, paths, np.setdiff1d(np.arange(len(paths)), members), view, like)
     members, X = np.concatenate([members, more]), np.concatenate([lead.X, X])
-    sight = view.sightings(paths[members], some, lasting=100.0)
+    sight = _held_frames_only(view.sightings(paths[members], some, lasting=100.0))
     bound = _spread_out(len(members), MOST_TRACKS)
     few, lost = sight.of(bound), np.zeros(0, int)
     best = {k: place_points(replace(b, X=X[bound]), few) for k, b in best.items()}
@@ -283,7 +286,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best, few = in_sight_only(*_together(best, few, paths, rest, view))
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
-    once, last, sure, probability, rival = _decided(best, others if still is None else None, few)
+    once, last, sure, probability, rival = _decided(best, others if still is None else None, few, refuted)
     weight = few.weight
     if few.link is not None:
         view = view.corrected(last, some)
@@ -291,7 +294,8 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         once = last
     sight = replace(sight, weight=np.interp(np.arange(len(members)), bound, weight), lasting=few.lasting)
     sight.seen[bound] = few.seen[: len(bound)]
-    every = replace(view.sightings(paths[members], np.arange(T), few.lasting), weight=sight.weight)
+    every = _held_frames_only(view.sightings(paths[members], np.arange(T), few.lasting))
+    every = replace(every, weight=sight.weight)
     sight.seen[:, np.isin(some, lost)], every.seen[:, lost] = False, False
 
     def whole(b: Bundle) -> Bundle:
@@ -306,7 +310,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     return Finished(whole(last), every, members, sure, probability, view, rival, first, len(lost))
 
 
-def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | None, s: Sightings
+def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | None, s: Sightings, refuted: str | None
              ) -> tuple[Bundle, Bundle, Spread, dict[str, float], Rival | None]:  # fmt: skip
     """The type, and its joint at its best.
 
@@ -314,14 +318,14 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
         best: of every type, the start that was better in the first round.
         others: those that were not; None before a camera whose path is fitted with the joint, where every one would
             need its own.
-        s: their observations.
+        s: their observations.  refuted: as of :func:`finish`.
 
     Returns:
         The joint as one adjustment found it, the better one that halves of the link, the other starts and the tracks
         without strays lead to, its uncertainty, the types' probabilities, and the most probable other axis.
     """
     if others is None:
-        probability = type_probabilities(best, s)
+        probability = _left(type_probabilities(best, s), refuted)
         last = best[_winner(probability)]
         return last, last, spread(last, s), probability, None
 
@@ -330,14 +334,14 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
 
     best, near = dict(best), []
     hinges = [best["revolute"], *again("revolute")]
-    if _winner(type_probabilities(best, s)) == "prismatic":
+    if _winner(_left(type_probabilities(best, s), refuted)) == "prismatic":
         every = [*hinges, polish(best["revolute"], s, hold=HELD)]
         near = [b for b in every if radius_cost(b, s) < NEAR * b.sigma**2 * s.lasting and turn_deg(b) < 360]
     else:
         # Until the errors are known the priors weigh much, and strays prefer what they will: on all frames another
         # start may be the better one.
         best["revolute"] = cheapest(hinges, s)
-    probability = type_probabilities(best, s, near)
+    probability = _left(type_probabilities(best, s, near), refuted)
     once = best[_winner(probability)]
     other = [b for b in hinges if b is not once] if once.kind == "revolute" else again(once.kind)
     better, several = halves(once, s)
@@ -393,6 +397,12 @@ def _without_strays(joints: Sequence[Bundle], sight: Sightings) -> Sightings:
     return replace(sight, seen=sight.seen & ~lost)
 
 
+def _held_frames_only(sight: Sightings) -> Sightings:
+    """The sightings without frames that fewer than HOLDERS tracks show: any one track is followed by some states, and a
+    stray that goes on alone takes them out of all bounds. Of tracks without slip :func:`held_only` asks more."""
+    return sight if sight.slip is None else replace(sight, seen=sight.seen & (sight.seen.sum(0) >= HOLDERS))
+
+
 def _spread_out(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
@@ -446,6 +456,12 @@ def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, paths: 
 
 def _winner(probability: dict[str, float]) -> str:
     return max(probability, key=lambda k: probability[k])
+
+
+def _left(probability: dict[str, float], refuted: str | None) -> dict[str, float]:
+    """The probabilities of the types, one of which is none."""
+    left = {k: 0.0 if k == refuted else max(p, 1e-300) for k, p in probability.items()}
+    return {k: p / sum(left.values()) for k, p in left.items()} if refuted else probability
 
 
 SURE = 20.0

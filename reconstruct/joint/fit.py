@@ -40,6 +40,7 @@ from reconstruct.joint.select import (
     motion_stretches,
     observations,
     search,
+    search_regions,
     sharpened,
     worth,
 )
@@ -61,6 +62,7 @@ NO_LINK = "no joint: the points of the tracks that agree with the best one are t
 NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
 APART = "the camera moves, and hardly any frame shows the scene and the part together"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
+NO_SLIDE = "a slide is more probable, but its points would move as a free body, those of the hinge do not"
 STRAYS = "most of what leaves its place does not follow it"
 ANY_DEG = float(np.degrees(np.sqrt(np.pi - 2)))
 """Root of the mean square angle between an axis and one at random. Three such answers from pixels were 50 deg and more
@@ -78,8 +80,8 @@ and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0
 0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
 
 TRIES = 3
-"""Draws of the search before a joint is refused: where most of what moves is a shadow or an arm, one in three finds
-nothing better than that."""
+"""Draws of the search before a joint is refused, the second with two regions of the picture besides, the third with
+three: where most of what moves is a shadow or an arm, a draw may find nothing better than that."""
 PARTS = (slice(0, 7), slice(3, 10))
 """Tenths of the motion that are asked alone where all of it follows no joint, of trackers that do not measure how well
 the picture holds a point: these lose a door that is seen on edge, and go on saying where it is."""
@@ -138,7 +140,7 @@ def fit_joint(
             return fit or JointFit("refused", NO_SCENE, tracks=len(paths))
     answer, before, most, sigma = None, None, 0.0, np.nan
     for k in range(TRIES):
-        draw = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES))
+        draw = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES), k + 1)
         fit = draw.fit
         # Asked often enough something may pass for a joint: a later draw has to explain what the others missed, or no
         # less by far more exactly.
@@ -250,16 +252,17 @@ def _more(ids: np.ndarray, than: np.ndarray, times: float = 1.0) -> bool:
 
 
 def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
-              pictures: Pictures | None, tell: Callable[[float], None]) -> _Draw:  # fmt: skip
+              pictures: Pictures | None, tell: Callable[[float], None], regions: int = 1) -> _Draw:  # fmt: skip
     """The joint before a camera that rests or is held in a hand, by one draw of hypotheses.
 
     Args:
         paths: of all tracks, working px.
         known: focal length in full px, None where the prior's mean is taken.
         pictures: whose faces may hold the joint better than the tracks do; None where the tracks are all there is.
+        regions: of the picture that are searched by themselves besides, if more than one.
     """
-    note = ""
-    found = _consensus(paths, camera, rng, lambda x: tell(0.85 * x))
+    note, no_slide = "", False
+    found = _consensus(paths, camera, rng, lambda x: tell(0.85 * x), regions)
 
     def refused(reason: str, members: np.ndarray, sigma: float = np.nan) -> _Draw:
         return _Draw(JointFit("refused", reason, tracks=len(paths), inliers=len(members)), found.explained, sigma)
@@ -282,6 +285,11 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
             restless = _restlessness(paths, camera, 0.5)
             starts, members = _sharpened(found, paths - camera.centre, view, camera)
             done = finish(starts, paths - camera.centre, members, view)
+            if done.bundle.kind == "prismatic" and FREELY in (why_not_believed(done, restless) or ""):
+                # There is no joint only if every type is refuted, however few of the tracks speak for the other.
+                hinge = finish(starts, paths - camera.centre, members, view, refuted="prismatic")
+                no_slide = not why_not_believed(hinge, restless)
+                done = hinge if no_slide else done
         else:
             done, restless, words = _hand_held(found, paths, video.warp, view, camera)
             note += words
@@ -293,6 +301,8 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
         done, note = _better_held(done, pictures, note)
     full = camera.focal / video.scale
     fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
+    if no_slide:
+        fit = doubtful(fit, NO_SLIDE)
     return _Draw(fit, found.explained, done.bundle.sigma, done)
 
 
@@ -409,7 +419,8 @@ def _restlessness(paths: Paths, camera: _Camera, share: float) -> float:
     return float(np.quantile(np.sqrt(np.nanmean(off**2, axis=(1, 2))), share))
 
 
-def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None]) -> _Consensus:
+def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None],
+               regions: int = 1) -> _Consensus:  # fmt: skip
     moving = _moving(paths, camera.diagonal)
     if len(moving) < MIN_INLIERS:
         return _Consensus(refusal=f"nothing moves: {len(moving)} of {len(paths)} tracks leave their place")
@@ -421,6 +432,8 @@ def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Ca
     if len(obs.ref) < MIN_INLIERS:
         return _Consensus(refusal=f"only {len(obs.ref)} moving tracks last long enough")
     ranked = search(obs, rng, progress=lambda x: tell(0.9 * x))
+    if regions > 1:
+        ranked = sorted(ranked + search_regions(obs, rng, regions), key=lambda s: -worth(s, obs))
     best: dict[str, State] = {}
     for s in ranked:
         best.setdefault(s.kind, s)

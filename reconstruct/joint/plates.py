@@ -150,6 +150,8 @@ def _starts(b: Bundle, s: Sightings) -> list[Bundle]:
             continue
         z, front = _laid(rays[some], normal)
         seen = s.seen[some] & front
+        if seen.sum() < KEPT * s.seen[some].sum():
+            continue  # much of the link would be behind the camera's horizon of the plane
         turn = _turn(z, seen, normal, s.uv[some], f)
         if turn is not None:
             tried.append((turn[0], normal, turn[1]))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
@@ -404,6 +405,10 @@ CLEAR_SHARE, CLEAR_PX = 0.4, 1.2
 wider search."""
 
 
+FEWEST_OF_REGION, OF_REGION = 12, 4
+"""Tracks of a region below which it is not searched, and joints of one that are carried on."""
+
+
 def search(
     obs: Observations,
     rng: np.random.Generator,
@@ -430,6 +435,32 @@ def search(
     progress(0.5)
     out = first + _best_of(hyps, obs, coarse, fine, thorough=True, more=more)
     progress(1.0)
+    return sorted(out, key=lambda s: -worth(s, obs))
+
+
+def search_regions(obs: Observations, rng: np.random.Generator, count: int) -> list[State]:
+    """Joints of regions of the picture, each searched by itself, judged on all tracks; best first.
+
+    Where most of what moves is a shadow or what else the part uncovers, joints that draw on both explain much of
+    everything, and all starts end in one of these. The part is in one place of the picture: some region holds most of
+    it and little else.
+
+    Args:
+        count: of regions (k-means of the tracks' median places, from a row along the direction that they extend in).
+    """
+    place = np.array([np.median(obs.xy[i, obs.seen[i]], axis=0) for i in range(len(obs.ref))])
+    off = place - place.mean(0)
+    order = np.argsort(off @ np.linalg.svd(off, full_matrices=False)[2][0])
+    first = place[order[((np.arange(count) + 0.5) / count * len(place)).astype(int)]]
+    region = kmeans2(place, first, minit="matrix")[1]
+    out: list[State] = []
+    for k in range(count):
+        here = region == k
+        if here.sum() < FEWEST_OF_REGION:
+            continue
+        for s in distinct(search(obs.of(here), rng), OF_REGION):
+            whole = solve_depths(replace(s, depth=np.ones(len(obs.ref))), obs)
+            out += [sharpened(whole, obs)]
     return sorted(out, key=lambda s: -worth(s, obs))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from reconstruct.joint.finish import View, _decided, finish
 from reconstruct.joint.paths import Paths
-from reconstruct.joint.polish import Bundle, cheapest, place_points, polish
+from reconstruct.joint.polish import HOLDERS, Bundle, cheapest, place_points, polish
 from reconstruct.joint.twist import Twist
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
@@ -55,7 +55,7 @@ def test_a_start_that_the_first_round_prefers_wrongly_is_found_out():
     away = polish(place_points(mirrored(truth), s), s, iterations=30)
     assert off_deg(away, truth) > 20
     best = {"revolute": away, "prismatic": polish(_slide(away), s), "screw": polish(replace(away, kind="screw"), s)}
-    once, last, sure, probability, rival = _decided(best, {"revolute": [truth]}, s)
+    once, last, sure, probability, rival = _decided(best, {"revolute": [truth]}, s, None)
     assert once.kind == "revolute" and probability["revolute"] > 0.9
     assert off_deg(once, truth) < 1 and off_deg(last, truth) < 1
     assert sure.axis_deg < 2
@@ -76,3 +76,27 @@ def test_joints_are_compared_by_one_noise():
     worse = polish(place_points(mirrored(truth), s), s, iterations=30)
     assert cheapest([worse, good], s) is good
     assert cheapest([replace(good, cost=np.inf), worse], s) is not worse
+
+
+def test_a_type_that_is_refuted_is_out_of_the_question():
+    """Beside a slide of the same stroke a hinge is improbable; told that it is none the hinge is taken all the same."""
+    truth, s = scene("prismatic", 0, stroke=0.05)
+    starts, paths, ids = {"prismatic": [truth]}, Paths(s.uv, None), np.arange(len(s.uv))
+    usual = finish(starts, paths, ids, View(FOCAL))
+    assert usual.bundle.kind == "prismatic" and usual.probability["prismatic"] > 0.9
+    hinge = finish(starts, paths, ids, View(FOCAL), refuted="prismatic")
+    assert hinge.bundle.kind == "revolute"
+    assert hinge.probability["prismatic"] == 0 and sum(hinge.probability.values()) == 1
+
+
+def test_a_track_that_goes_on_alone_takes_no_state_with_it():
+    """One track follows any state: the last frames of a stapler were 238 times its stroke away, and it was refused."""
+    truth, s = scene("revolute", 3, points=40, frames=40)
+    uv = s.uv.copy()
+    uv[HOLDERS - 1 :, 30:] = np.nan
+    uv[: HOLDERS - 1, 30:] += np.cumsum(np.full((HOLDERS - 1, 10, 2), 60.0), axis=1)
+    paths = Paths(uv, np.zeros_like(uv))
+    done = finish({"revolute": [truth]}, paths, np.arange(len(uv)), View(FOCAL))
+    assert off_deg(done.bundle, truth) < 2
+    assert np.ptp(done.bundle.q) < 1.5 * np.ptp(truth.q[:30])
+    assert not done.sight.seen[:, 30:].any()

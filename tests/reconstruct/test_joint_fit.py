@@ -12,7 +12,8 @@ from reconstruct.joint.finish import View, finish
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.models import JointFit, joint_transform
 from reconstruct.joint.paths import Paths
-from reconstruct.joint.select import _tilted_back, explained, key_frames, observations, worth
+from reconstruct.joint.result import FREELY
+from reconstruct.joint.select import _tilted_back, explained, key_frames, observations, search_regions, worth
 from tests.reconstruct.joint_scenes import H, W, make_scene, make_video, project
 
 SLAB = [[-0.3, 0.3], [-0.4, 0.0], [-0.02, 0.02]]
@@ -134,9 +135,9 @@ def test_a_search_that_is_out_of_luck_is_drawn_again(monkeypatch):
     scene, real, asked = make_scene(**SCENES["drawer"]), fit_module._consensus, []
 
     def unlucky(times, explained=0.5):
-        def consensus(uv, camera, rng, tell):
+        def consensus(uv, camera, rng, tell, regions):
             asked.append(float(rng.random()))
-            found = real(uv, camera, rng, tell)
+            found = real(uv, camera, rng, tell, regions)
             less = replace(found, refusal=f"draw {len(asked)}", explained=explained * found.explained)
             return less if len(asked) <= times else found
 
@@ -229,3 +230,43 @@ def test_another_stretch_has_to_explain_clearly_more():
     several = [_Consensus(explained=x) for x in (154.7, 157.4, 96.3)]
     assert _dominant(several) is several[0]
     assert _dominant([*several, clear := _Consensus(explained=190.0)]) is clear
+
+
+def test_a_region_of_the_picture_shows_the_part_beside_what_moves_otherwise():
+    """The first of its joints, judged on all tracks, is the part's though most of what moves is elsewhere."""
+    scene = make_scene(**SCENES["drawer"])
+    tracks, T = scene.tracks, len(scene.video)
+    rng = np.random.default_rng(4)
+    uv = scene.video.to_work(tracks.uv)
+    moving = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=1) > 0.05 * W
+    uv = uv[moving & tracks.visible.any(1)]
+    keys = key_frames(uv)
+    obs, _ = observations(Paths(uv, None), 768.0 * scene.video.scale, np.array([(W - 1) / 2, (H - 1) / 2]), keys, 260,
+                          rng, float(np.hypot(H, W)))  # fmt: skip
+    found = search_regions(obs, np.random.default_rng(0), 3)
+    assert T > 0 and found and worth(found[0], obs) == max(worth(s, obs) for s in found)
+    assert all(len(s.depth) == len(obs.ref) for s in found)
+    off = np.degrees(np.arccos(min(1.0, abs(float(found[0].axis @ scene.axis)))))
+    assert found[0].kind == "prismatic" and off < 3
+    assert search_regions(obs.of(np.arange(9)), np.random.default_rng(0), 2) == []
+
+
+@pytest.mark.parametrize("hinge_believed", [True, False])
+def test_a_slide_that_is_none_is_a_hinge_if_that_is_believed(monkeypatch, hinge_believed):
+    """There is no joint only if every type is refuted."""
+    scene, asked = make_scene(**SCENES["drawer"]), []
+
+    def why(done, *_):
+        asked.append(done.bundle.kind)
+        return None if done.bundle.kind == "revolute" and hinge_believed else f"{FREELY}: made"
+
+    monkeypatch.setattr(fit_module, "why_not_believed", why)
+    monkeypatch.setattr(fit_module, "TRIES", 1)
+    monkeypatch.setattr(fit_module, "_slight", lambda *_: None)
+    fit = fit_joint(scene.video, scene.tracks, focal_px=768.0)
+    assert asked[:2] == ["prismatic", "revolute"]
+    if hinge_believed:
+        assert (fit.verdict, fit.type) == ("ambiguous", "revolute") and fit.reason.startswith(fit_module.NO_SLIDE)
+        assert 0.1 < fit.type_probability["prismatic"] < fit.type_probability["revolute"]
+    else:
+        assert fit.verdict == "refused" and FREELY in fit.reason

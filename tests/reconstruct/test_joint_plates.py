@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.finish import Finished, View, turn_deg
 from reconstruct.joint.normal import normal_equations
-from reconstruct.joint.plates import FEWEST, FLAT, WORTH_DEG, as_plate
+from reconstruct.joint.plates import FEWEST, FLAT, WORTH_DEG, _starts, as_plate
 from reconstruct.joint.polish import Bundle, Sightings, polish, positions, residuals, robust_loss
 from reconstruct.joint.shape import Flat
 from reconstruct.joint.twist import twist_of_joint
@@ -131,3 +131,14 @@ def test_the_plane_is_in_the_normal_equations_as_its_cost_is():
         slope = (flat.cost(replace(b, X=b.X + step)) - flat.cost(replace(b, X=b.X - step))) / (4 * h)
         assert gp[i, j] == pytest.approx(slope, rel=1e-4, abs=1e-6)
     np.testing.assert_allclose(with_it.scores.sum(0), with_it.g, atol=1e-6)
+
+
+def test_planes_whose_horizon_cuts_the_link_are_not_tried():
+    """Of one that is seen nearly on edge most points were nowhere, and its turn had no radius."""
+    X = blade(np.random.default_rng(0))
+    done = joint(X, 10.0, 0.3, 0)
+    away = Rotation.from_euler("y", 50, degrees=True).apply(X - PIVOT) * [8.0, 8.0, 1.0] + [0, 0, 2.0]
+    wide = replace(done.sight, uv=FOCAL * (away[:, None, :2] / away[:, None, 2:]) + np.zeros((N, T, 2)))
+    wide = replace(wide, uv=wide.uv + np.linspace(0, 8, T)[:, None] * np.array([0.3, 1.0]))
+    for start in _starts(done.bundle, wide):
+        assert np.isfinite(start.twist.curvature).all() and np.isfinite(start.X).all()
