@@ -21,7 +21,7 @@ FEWEST = 8
 """Frames that have to show a track for its unrest to be known."""
 AS_FAR = 2.0
 """Over its step times the root of the number of steps, how far a track has to get to go somewhere. Of random walks half
-to two thirds get less far (5 % as far as 3), of tracks on the links of 80 rendered films 1.4 %, of those of eight real
+to two thirds get less far (5 % as far as 3), of tracks on the links of 27 rendered films 1.4 %, of those of seven real
 joints none, of the other points beside rendered links that leave their place and are on no shadow's edge half."""
 
 

@@ -134,11 +134,15 @@ def test_the_plane_is_in_the_normal_equations_as_its_cost_is():
 
 
 def test_planes_whose_horizon_cuts_the_link_are_not_tried():
-    """Of one that is seen nearly on edge most points were nowhere, and its turn had no radius."""
-    X = blade(np.random.default_rng(0))
-    done = joint(X, 10.0, 0.3, 0)
-    away = Rotation.from_euler("y", 50, degrees=True).apply(X - PIVOT) * [8.0, 8.0, 1.0] + [0, 0, 2.0]
-    wide = replace(done.sight, uv=FOCAL * (away[:, None, :2] / away[:, None, 2:]) + np.zeros((N, T, 2)))
-    wide = replace(wide, uv=wide.uv + np.linspace(0, 8, T)[:, None] * np.array([0.3, 1.0]))
-    for start in _starts(done.bundle, wide):
-        assert np.isfinite(start.twist.curvature).all() and np.isfinite(start.X).all()
+    """Of one that has most points behind its horizon these were nowhere, and its turn had no radius."""
+    rng = np.random.default_rng(0)
+    done = joint(blade(rng), 10.0, 0.3, 0)
+    corners = np.repeat([[-1.0, -1.0], [-1.0, 1.0], [1.0, -0.7], [1.0, 1.0]], [20, 24, 24, 12], axis=0)
+    uv = FOCAL * (corners + rng.normal(scale=0.1, size=(N, 2)))[:, None] + np.zeros((N, T, 2))
+    # The few in one corner turn about a point of it exactly; the others, by far the most, go nowhere together.
+    turn = np.exp(0.2j * np.linspace(0, 1, T))
+    own = (uv[:20, :, 0] + FOCAL) + 1j * (uv[:20, :, 1] + FOCAL)
+    uv[:20] = np.stack([(own * turn).real, (own * turn).imag], axis=-1) - FOCAL
+    uv[20:] += np.cumsum(rng.normal(scale=4.0, size=(N - 20, T, 2)), axis=1)
+    starts = _starts(done.bundle, replace(done.sight, uv=uv))
+    assert all(np.isfinite(s.twist.curvature).all() and np.isfinite(s.X).all() for s in starts)

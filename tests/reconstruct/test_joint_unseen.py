@@ -14,7 +14,7 @@ from reconstruct.joint.models import JointFit, joint_transform
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.unseen import from_first, with_unseen_states
 from reconstruct.joint.unseen.outline import Edges, Outline
-from reconstruct.joint.unseen.search import _best_path
+from reconstruct.joint.unseen.search import _best_path, _not_alone
 from reconstruct.providers.edge_tracks import all_segments, edge_tracks
 from reconstruct.video import Video
 
@@ -202,3 +202,15 @@ def test_best_path_prefers_what_is_in_reach() -> None:
     shares[np.arange(5), [10, 12, 14, 16, 18]] = 0.6
     shares[:, 40] = 1.0
     np.testing.assert_array_equal(_best_path(shares, 9, 3, 1e-3), [10, 12, 14, 16, 18])
+
+
+@pytest.mark.parametrize(("seen", "kept"), [
+    ([1], [1]),
+    ([0, 1], [0, 1]),
+    ([0, 0, 1], [0, 0, 0]),
+    ([1, 1, 1, 0, 0, 0, 1, 0], [1, 1, 1, 0, 0, 0, 0, 0]),
+    ([0, 0, 0, 1, 0, 1], [0, 0, 0, 0, 0, 1]),
+])  # fmt: skip
+def test_a_frame_is_shown_with_those_around_it_however_few_there_are(seen, kept):
+    """Of two frames at a video's end it was an error: more were counted about them than there are."""
+    assert _not_alone(np.array(seen, bool)).tolist() == [bool(k) for k in kept]

@@ -90,10 +90,9 @@ def states_shown(outline: Outline, edges: Edges, going: Going, q: np.ndarray, be
 
 def _not_alone(seen: np.ndarray) -> np.ndarray:
     """(F,) without frames about which others are not seen: from a known one outwards."""
-    known = np.concatenate([np.ones(ABOUT, bool), seen])
-    kernel = np.ones(2 * ABOUT + 1)
-    share = np.convolve(known, kernel, "same") / np.convolve(np.ones(len(known)), kernel, "same")
-    return seen & (share[ABOUT:] >= ABOUT_SEEN)
+    known = np.concatenate([np.ones(ABOUT), seen])
+    near = np.abs(np.subtract.outer(np.arange(len(known)), np.arange(len(known)))) <= ABOUT
+    return seen & ((near @ known / near.sum(1))[ABOUT:] >= ABOUT_SEEN)
 
 
 def _best_path(shares: np.ndarray, start: int, reach: int, cost: float) -> np.ndarray:
