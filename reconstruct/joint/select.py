@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -452,7 +453,9 @@ def search_regions(obs: Observations, rng: np.random.Generator, count: int) -> l
     off = place - place.mean(0)
     order = np.argsort(off @ np.linalg.svd(off, full_matrices=False)[2][0])
     first = place[order[((np.arange(count) + 0.5) / count * len(place)).astype(int)]]
-    region = kmeans2(place, first, minit="matrix")[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a region that has lost its tracks is not searched
+        region = kmeans2(place, first, minit="matrix")[1]
     out: list[State] = []
     for k in range(count):
         here = region == k
