@@ -354,7 +354,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     tracks = without(tracks, wandering(video, tracks))
     arm = on_forearm(tracks, hands)
     share = float(np.mean(arm[moving])) if len(moving := moving_tracks(video, tracks)) else 0.0
-    rest = replace(tracks, visible=tracks.visible & ~arm[:, None]) if share > 0 else tracks
+    rest = without(tracks, arm) if share > 0 else tracks
     lit = off_shadows(video, rest)
 
     def ask(some: Tracks) -> JointFit:

@@ -257,7 +257,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best, sight = in_sight_only(*_together(_across_kinds(best, sight), sight, paths, still, view))
     sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
-    probability = _left(type_probabilities(best, sight), refuted)
+    probability = _ruled_out(type_probabilities(best, sight), refuted)
     if probability.get("screw", 1.0) < NO_SCREW:
         del best["screw"]
 
@@ -325,7 +325,7 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
         without strays lead to, its uncertainty, the types' probabilities, and the most probable other axis.
     """
     if others is None:
-        probability = _left(type_probabilities(best, s), refuted)
+        probability = _ruled_out(type_probabilities(best, s), refuted)
         last = best[_winner(probability)]
         return last, last, spread(last, s), probability, None
 
@@ -334,14 +334,14 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
 
     best, near = dict(best), []
     hinges = [best["revolute"], *again("revolute")]
-    if _winner(_left(type_probabilities(best, s), refuted)) == "prismatic":
+    if _winner(_ruled_out(type_probabilities(best, s), refuted)) == "prismatic":
         every = [*hinges, polish(best["revolute"], s, hold=HELD)]
         near = [b for b in every if radius_cost(b, s) < NEAR * b.sigma**2 * s.lasting and turn_deg(b) < 360]
     else:
         # Until the errors are known the priors weigh much, and strays prefer what they will: on all frames another
         # start may be the better one.
         best["revolute"] = cheapest(hinges, s)
-    probability = _left(type_probabilities(best, s, near), refuted)
+    probability = _ruled_out(type_probabilities(best, s, near), refuted)
     once = best[_winner(probability)]
     other = [b for b in hinges if b is not once] if once.kind == "revolute" else again(once.kind)
     better, several = halves(once, s)
@@ -458,8 +458,8 @@ def _winner(probability: dict[str, float]) -> str:
     return max(probability, key=lambda k: probability[k])
 
 
-def _left(probability: dict[str, float], refuted: str | None) -> dict[str, float]:
-    """The probabilities of the types, one of which is none."""
+def _ruled_out(probability: dict[str, float], refuted: str | None) -> dict[str, float]:
+    """The probabilities of the types, that of a refuted one 0; as they are where none is refuted."""
     left = {k: 0.0 if k == refuted else max(p, 1e-300) for k, p in probability.items()}
     return {k: p / sum(left.values()) for k, p in left.items()} if refuted else probability
 

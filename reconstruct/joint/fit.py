@@ -285,17 +285,19 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
             restless = _restlessness(paths, camera, 0.5)
             starts, members = _sharpened(found, paths - camera.centre, view, camera)
             done = finish(starts, paths - camera.centre, members, view)
-            if done.bundle.kind == "prismatic" and FREELY in (why_not_believed(done, restless) or ""):
+            reason = why_not_believed(done, restless)
+            if done.bundle.kind == "prismatic" and FREELY in (reason or ""):
                 # There is no joint only if every type is refuted, however few of the tracks speak for the other.
                 hinge = finish(starts, paths - camera.centre, members, view, refuted="prismatic")
-                no_slide = not why_not_believed(hinge, restless)
-                done = hinge if no_slide else done
+                if no_slide := not why_not_believed(hinge, restless):
+                    done, reason = hinge, None
         else:
             done, restless, words = _hand_held(found, paths, video.warp, view, camera)
             note += words
+            reason = why_not_believed(done, restless)
     except NoLink:
         return refused(NO_LINK, found.members)
-    if reason := why_not_believed(done, restless):
+    if reason:
         return refused(reason, done.members, done.bundle.sigma)
     if video.warp is None:
         done, note = _better_held(done, pictures, note)

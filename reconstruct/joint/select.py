@@ -447,7 +447,11 @@ def search_regions(obs: Observations, rng: np.random.Generator, count: int) -> l
     it and little else.
 
     Args:
+        obs: key-frame observations of N moving tracks.  rng: of the searches.
         count: of regions (k-means of the tracks' median places, from a row along the direction that they extend in).
+
+    Returns:
+        States with the depths of all N tracks.
     """
     place = np.array([np.median(obs.xy[i, obs.seen[i]], axis=0) for i in range(len(obs.ref))])
     off = place - place.mean(0)
