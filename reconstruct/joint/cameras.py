@@ -8,6 +8,8 @@ camera's path is smoother, since the path before the other has the joint's start
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -144,6 +146,10 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
     both = np.flatnonzero(static.shown & link.shown)
     if len(both) < 3:
         return {}
+    # Where both are in sight first the link has not moved; what is found is brought back at the end.
+    begin = static.R[both[0]], static.t[both[0]]
+    if both[0] > 0:
+        static, link = _seen_from(static, both[0]), _seen_from(link, both[0])
     every, R = np.arange(len(static.R)), static.R[both]
     D = np.swapaxes(R, 1, 2) @ link.R[both]
     p = np.einsum("tji,tj->ti", R, link.t[both])
@@ -196,4 +202,17 @@ def joints_between(static: Rigid, link: Rigid) -> dict[str, list[Bundle]]:
         q = np.interp(every, both, q)
         slide = Twist(ratio * np.median(points, axis=0), along, np.zeros(3))
         out["prismatic"].append(Bundle("prismatic", slide, q - q[0], ratio * points))
-    return out
+    return {kind: [_before(b, *begin) for b in several] for kind, several in out.items()} if both[0] > 0 else out
+
+
+def _seen_from(body: Rigid, frame: int) -> Rigid:
+    """The body in the frame of another camera than its own."""
+    R = body.R @ body.R[frame].T
+    return replace(body, R=R, t=body.t - R @ body.t[frame], X=body.X @ body.R[frame].T + body.t[frame])
+
+
+def _before(b: Bundle, R: np.ndarray, t: np.ndarray) -> Bundle:
+    """A joint in a camera's frame in the world's; R (3, 3), t (3,) world to camera."""
+    w = b.twist
+    twist = Twist((w.anchor - t) @ R, w.direction @ R, w.curvature @ R)
+    return replace(b, twist=twist, X=(b.X - t) @ R)

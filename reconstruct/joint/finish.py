@@ -85,10 +85,11 @@ LIKELY = 0.1
 
 @dataclass(frozen=True)
 class Rival:
-    """Another axis of the same type that explains the motion too: how far off it is, and its probability."""
+    """Another joint of the same type that explains the motion too: how far off its axis is, and how probable it is."""
 
     apart_deg: float
     probability: float
+    joint: Bundle
 
 
 @dataclass(frozen=True)
@@ -307,6 +308,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     if len(some) < T:
         sure = replace(sure, q=np.interp(np.arange(T), some, sure.q))
     first = None if once is last else whole(once)
+    rival = None if rival is None else replace(rival, joint=whole(rival.joint))
     return Finished(whole(last), every, members, sure, probability, view, rival, first, len(lost))
 
 
@@ -631,7 +633,7 @@ def _rival(last: Bundle, others: Sequence[Bundle], sight: Sightings) -> Rival | 
     for b in others:
         if (apart := apart_deg(b, last)) > APART_DEG:
             odds = log_odds_of_same_type(last, b, sight)
-            found.append(Rival(apart, float(expit(-odds))))
+            found.append(Rival(apart, float(expit(-odds)), b))
     return max(found, key=lambda r: r.probability, default=None)
 
 

@@ -213,7 +213,9 @@ def _slight(video: Video, paths: Paths, camera: _Camera, view: View, known: floa
         if not _more(ids, before.members, times):
             return None
         every = view.sightings(paths[ids], np.arange(paths.uv.shape[1]), lasting=100.0)
-        starts.setdefault(before.bundle.kind, []).append(placed_on(before.bundle, every))
+        others = [] if before.rival is None else [before.rival.joint]
+        for b in (before.bundle, *others):
+            starts.setdefault(b.kind, []).append(placed_on(b, every))
     try:
         done = finish(starts, paths, ids, view)
     except NoLink:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation, Slerp
 
 from reconstruct.joint.paths import held
@@ -29,6 +30,8 @@ GROWN = 6
 """Neighbourhoods that are grown to bodies."""
 POSE_HOLDERS = 6
 """Tracks that a frame must show for a body's pose to be held there: twice what a pose needs."""
+LEAST_SEEN = 4
+"""Frames that have to show a track for it to be a body's."""
 FINISHED = 3
 """Bodies that are looked at in all frames."""
 SLOW, SLOW_WINDOWS = 4.0, 5
@@ -346,13 +349,13 @@ def _track_cost(x, seen, R, t, X, focal, scale: float) -> np.ndarray:
     r2 = _residuals2(x, seen, R, t, X, focal)
     count = seen.sum(1)
     cost = np.sum(np.where(seen, r2 / (scale**2 + r2), 0.0), axis=1) / np.maximum(count, 1)
-    return np.where(count >= 4, cost, 1.0)
+    return np.where(count >= LEAST_SEEN, cost, 1.0)
 
 
 def _members(x, seen, R, t, X, focal, px: float) -> np.ndarray:
     r2 = np.where(seen, _residuals2(x, seen, R, t, X, focal), np.nan)
     out = np.zeros(len(x), bool)
-    enough = seen.sum(1) >= 4
+    enough = seen.sum(1) >= LEAST_SEEN
     out[enough] = np.nanmedian(r2[enough], axis=1) < px**2
     return out
 
@@ -430,11 +433,26 @@ def _whole(x, candidates, keys, R, t, members, focal) -> Rigid | None:
     if unit <= 0:
         return None
     cost = _track_cost(x, seen, R, t, X, focal, LOSS_SIGMAS * max(sigma, 0.25))
-    shown = seen[members].sum(0) >= POSE_HOLDERS
-    if shown.sum() < 2:
+    members, shown = _in_one_piece(seen, members)
+    if shown.sum() < 2 or members.sum() < MIN_GROUP:
         return None
     R, t = between(R[shown], t[shown], np.flatnonzero(shown), len(R))
     return Rigid(R, t / unit, X / unit, members, sigma, cost, shown)
+
+
+def _in_one_piece(seen: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) members and (T,) frames of the largest part of a body whose frames chains of tracks hold to each other.
+
+    What is in sight before a gap and what is after it fit one path whatever lies between them: a lid's outer face, and
+    its inner one.
+    """
+    shown = np.flatnonzero(seen[members].sum(0) >= POSE_HOLDERS)
+    some = seen[members][:, shown].astype(np.float32)
+    part = connected_components(some.T @ some >= POSE_HOLDERS, directed=False)[1]
+    out = np.zeros(seen.shape[1], bool)
+    if len(part):
+        out[shown[part == np.argmax(np.bincount(part, weights=some.sum(0)))]] = True
+    return members & (seen[:, out].sum(1) >= LEAST_SEEN), out
 
 
 def between(R: np.ndarray, t: np.ndarray, known: np.ndarray, T: int) -> tuple[np.ndarray, np.ndarray]:

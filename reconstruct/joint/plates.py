@@ -84,7 +84,7 @@ def as_plate(done: Finished) -> Finished:
     axis_deg = float(np.sqrt(sure.axis_deg**2 + OWN_DEG**2 + p[-1] * off**2))
     if axis_deg >= free:
         return done
-    rivals = [Rival(apart_deg(best.bundle, o.bundle), float(x)) for o, x in zip(others, p[1:-1], strict=True)]
+    rivals = [Rival(apart_deg(best.bundle, o.bundle), float(x), o.whole) for o, x in zip(others, p[1:-1], strict=True)]
     rival = max((r for r in rivals if r.apart_deg > RIVAL_DEG), key=lambda r: r.probability, default=None)
     return replace(done, bundle=best.bundle, sight=best.sight, members=done.members[best.kept],
                    spread=replace(sure, axis_deg=axis_deg), rival=rival, once=None)  # fmt: skip

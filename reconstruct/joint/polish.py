@@ -459,6 +459,8 @@ def place_points(b: Bundle, s: Sightings, rounds: int = 6) -> Bundle:
         H += (1e-4 * np.trace(H, axis1=1, axis2=2) / 3 + 1e-12)[:, None, None] * np.eye(3)
         for more in (Reach.of(b, s, b.sigma).slopes(b.X), Flat.of(b, s, b.sigma).slopes(b)):
             H, g = H + more[0], g + more[1]
+        # What no frame shows has nothing but the prior of its depth.
+        H += (1e-9 * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)
         step = -np.linalg.solve(H, g[..., None])[..., 0]
         limit_step = 0.4 * np.linalg.norm(b.X, axis=1)
         step *= np.minimum(1, limit_step / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]

@@ -10,7 +10,15 @@ from scipy.spatial.transform import Rotation
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.cameras import before_the_link, camera_moves, joints_between, smoother_before_the_link
 from reconstruct.joint.fit import fit_joint
-from reconstruct.joint.groups import Rigid, begun_beside, between, rigid_group, two_bodies
+from reconstruct.joint.groups import (
+    POSE_HOLDERS,
+    Rigid,
+    _in_one_piece,
+    begun_beside,
+    between,
+    rigid_group,
+    two_bodies,
+)
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.polish import Bundle, Sightings, polish, regauged, residuals
 from reconstruct.joint.twist import Twist, twist_of_joint
@@ -190,6 +198,54 @@ def test_frames_that_do_not_show_the_link_have_no_say_in_where_it_is_started():
     assert abs(start.twist.direction @ slide.direction) > 0.999
     assert np.ptp(start.q) == pytest.approx(np.ptp(q[shown]), rel=0.02)
     assert joints_between(rigid(turn, t, X, shown), rigid(R_link, t_link, X, ~shown)) == {}
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_link_that_comes_into_sight_late_is_started_where_it_is(kind):
+    """What its path begins from is any pose then, and no turn of the joint."""
+    rng, T, late = np.random.default_rng(1), 40, 15
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, np.radians(25), T), [0, 1, 0])).as_matrix()
+    t = np.array([0, 0, 1.9]) - turn @ [0, 0, 1.9]
+    X = POINT + rng.uniform([0.02, -0.3, -0.1], [0.5, 0.3, 0.0], (40, 3))
+    if kind == "revolute":
+        twist, speed = twist_of_joint(kind, AXIS, POINT, X.mean(0))
+    else:
+        twist, speed = Twist(X.mean(0), np.array([0.6, 0.0, -0.8]), np.zeros(3)), 1.0
+    q = speed * np.linspace(0, 0.8, T)
+    R_link, t_link = before_the_link(twist, q, turn, t)
+    # Its body in a frame of its own, in units of its own, and of no pose before it is seen.
+    G, g, unit = Rotation.from_rotvec([0.5, -0.9, 0.3]).as_matrix(), np.array([0.2, -0.4, 0.6]), 1.3
+    R_own, t_own = R_link @ G.T, (t_link - R_link @ G.T @ g) / unit
+    shown = np.arange(T) >= late
+    R_own, t_own = between(R_own[shown], t_own[shown], np.flatnonzero(shown), T)
+    link = rigid(R_own, t_own, (X @ G.T + g) / unit, shown)
+    start = max(joints_between(rigid(turn, t, X, np.ones(T, bool)), link)[kind],
+                key=lambda b: abs(b.twist.axis @ twist.axis))  # fmt: skip
+    assert np.degrees(np.arccos(min(1.0, abs(start.twist.axis @ twist.axis)))) < 0.1
+    # Its points are where they are in the first frame that shows them, and in all before.
+    back = start.twist.pose(start.q[[late]])
+    at = twist.pose(q[[late]])
+    there = twist.anchor + (X - twist.anchor) @ at[0][0].T + at[1][0]
+    np.testing.assert_allclose(start.q[:late], 0.0, atol=1e-9)
+    np.testing.assert_allclose(start.X, there, atol=0.02)
+    np.testing.assert_allclose(back[0][0], np.eye(3), atol=1e-6)
+    if kind == "revolute":
+        off = start.twist.point - POINT
+        assert np.linalg.norm(off - (off @ AXIS) * AXIS) < 0.01
+
+
+def test_what_nothing_holds_together_is_not_one_body():
+    """A lid's outer face is seen until it stands on edge, its inner one from then on."""
+    seen = np.zeros((80, 40), bool)
+    seen[:30, :15], seen[30:75, 22:] = True, True
+    members = np.arange(80) < 78
+    for bridge, frames in ((0, 18), (POSE_HOLDERS - 1, 18), (POSE_HOLDERS, 40)):
+        linked = seen.copy()
+        linked[:bridge] = True
+        kept, shown = _in_one_piece(linked, members)
+        assert shown.sum() == frames and shown[22:].all()
+        assert kept[30:75].all() and not kept[75:].any()
+        assert kept[:30].sum() == (30 if bridge == POSE_HOLDERS else bridge)
 
 
 def test_a_stroke_of_a_hundredth_of_the_cameras_path_is_started_right():

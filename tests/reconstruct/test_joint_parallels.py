@@ -103,7 +103,8 @@ def test_what_tracks_hold_and_slides_are_not_asked():
 
 
 def test_what_its_tracks_leave_in_doubt_stays_ambiguous():
-    joint = replace(door(BOX[1], 6.0), rival=Rival(10.0, 0.3))
+    alone = door(BOX[1], 6.0)
+    joint = replace(alone, rival=Rival(10.0, 0.3, alone.bundle))
     out = along_edges(joint, pictures(BOX))
     assert out is not joint and out.doubt
     frames = np.zeros((T, H, W, 3), np.uint8)

@@ -247,6 +247,16 @@ def test_points_find_their_place_and_strays_are_told_apart():
     assert compact(X).tolist() == [True] * len(truth.X) + [False] * 3
 
 
+def test_a_point_that_no_frame_shows_is_placed_by_its_prior_alone():
+    """There was no answer to that: a matrix of rank one."""
+    truth, s = scene("revolute", 5)
+    seen = s.seen.copy()
+    seen[0] = False
+    far = replace(truth, X=np.concatenate([3 * truth.X[:1], truth.X[1:]]), sigma=1000.0)
+    found = place_points(far, replace(s, seen=seen))
+    assert np.isfinite(found.X).all()
+
+
 def test_a_point_whose_depth_nothing_holds_says_nothing_about_the_unit():
     truth, s = scene("revolute", 5)
     seen, X = s.seen.copy(), truth.X.copy()
