@@ -13,10 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation, Slerp
 
-from reconstruct.joint.paths import held
+from reconstruct.joint.paths import held, linked_frames
 from reconstruct.joint.polish import noise
 from reconstruct.joint.twist import skew
 
@@ -446,13 +445,11 @@ def _in_one_piece(seen: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np
     What is in sight before a gap and what is after it fit one path whatever lies between them: a lid's outer face, and
     its inner one.
     """
-    shown = np.flatnonzero(seen[members].sum(0) >= POSE_HOLDERS)
-    some = seen[members][:, shown].astype(np.float32)
-    part = connected_components(some.T @ some >= POSE_HOLDERS, directed=False)[1]
-    out = np.zeros(seen.shape[1], bool)
-    if len(part):
-        out[shown[part == np.argmax(np.bincount(part, weights=some.sum(0)))]] = True
-    return members & (seen[:, out].sum(1) >= LEAST_SEEN), out
+    part = linked_frames(seen[members], POSE_HOLDERS)
+    shown = part >= 0
+    if shown.any():
+        shown = part == np.argmax(np.bincount(part[shown], weights=seen[members].sum(0)[shown]))
+    return members & (seen[:, shown].sum(1) >= LEAST_SEEN), shown
 
 
 def between(R: np.ndarray, t: np.ndarray, known: np.ndarray, T: int) -> tuple[np.ndarray, np.ndarray]:

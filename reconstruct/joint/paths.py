@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 
@@ -67,6 +68,21 @@ def held(r: np.ndarray, slip: np.ndarray | None) -> np.ndarray:
     if r.ndim == slip.ndim:
         return r - slip * np.sum(slip * r, axis=-1, keepdims=True)
     return r - slip[..., None] * np.sum(slip[..., None] * r, axis=-2, keepdims=True)
+
+
+def linked_frames(seen: np.ndarray, least: int) -> np.ndarray:
+    """(T,) int: which part each frame is in, of those that chains of so many tracks hold together; -1 for frames that
+    fewer show.
+
+    Args:
+        seen: (N, T) bool.
+    """
+    out = np.full(seen.shape[1], -1)
+    shown = np.flatnonzero(seen.sum(0) >= least)
+    if len(shown):
+        some = seen[:, shown].astype(np.float32)
+        out[shown] = connected_components(some.T @ some >= least, directed=False)[1]
+    return out
 
 
 def beside(uv: np.ndarray, seen: np.ndarray, some: np.ndarray, px: float) -> np.ndarray:

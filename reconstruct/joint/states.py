@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from reconstruct.joint.paths import held as along_held
+from reconstruct.joint.paths import linked_frames
 from reconstruct.joint.polish import HOLDERS, ROBUST_SIGMAS, Bundle, Sightings, positions, residuals
 
 HOLDING = 0.25
@@ -51,14 +51,8 @@ def unlinked(b: Bundle, s: Sightings) -> np.ndarray:
     Args:
         b: the joint.  s: its observations.
     """
-    near = near_tracks(b, s)
-    held = np.flatnonzero(near.sum(0) >= HOLDERS)
-    out = np.zeros(near.shape[1], bool)
-    if len(held):
-        shared = near[:, held].T.astype(np.float32) @ near[:, held].astype(np.float32)
-        part = connected_components(shared >= HOLDERS, directed=False)[1]
-        out[held] = part != part[0]
-    return out
+    part = linked_frames(near_tracks(b, s), HOLDERS)
+    return (part >= 0) & (part != part[np.argmax(part >= 0)])
 
 
 def held_only(best: dict[str, Bundle], s: Sightings) -> tuple[dict[str, Bundle], Sightings]:

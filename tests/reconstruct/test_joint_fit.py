@@ -235,7 +235,7 @@ def test_another_stretch_has_to_explain_clearly_more():
 def test_a_region_of_the_picture_shows_the_part_beside_what_moves_otherwise():
     """The first of its joints, judged on all tracks, is the part's though most of what moves is elsewhere."""
     scene = make_scene(**SCENES["drawer"])
-    tracks, T = scene.tracks, len(scene.video)
+    tracks = scene.tracks
     rng = np.random.default_rng(4)
     uv = scene.video.to_work(tracks.uv)
     moving = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=1) > 0.05 * W
@@ -244,7 +244,7 @@ def test_a_region_of_the_picture_shows_the_part_beside_what_moves_otherwise():
     obs, _ = observations(Paths(uv, None), 768.0 * scene.video.scale, np.array([(W - 1) / 2, (H - 1) / 2]), keys, 260,
                           rng, float(np.hypot(H, W)))  # fmt: skip
     found = search_regions(obs, np.random.default_rng(0), 3)
-    assert T > 0 and found and worth(found[0], obs) == max(worth(s, obs) for s in found)
+    assert found and worth(found[0], obs) == max(worth(s, obs) for s in found)
     assert all(len(s.depth) == len(obs.ref) for s in found)
     off = np.degrees(np.arccos(min(1.0, abs(float(found[0].axis @ scene.axis)))))
     assert found[0].kind == "prismatic" and off < 3

@@ -119,6 +119,7 @@ def test_tracks_that_stray_hold_nothing_together_and_frames_that_show_nothing_do
     seen = s.seen.copy()
     seen[:, 12:17] = False  # a hand before all of it, the same tracks after
     assert not unlinked(truth, replace(s, seen=seen)).any()
+    assert not unlinked(truth, replace(s, seen=np.zeros_like(seen))).any()
     s, bridging = in_two(s, 1, 8)
     uv = s.uv.copy()
     uv[bridging[2:], 20:] += 30.0
