@@ -15,6 +15,8 @@ from reconstruct.joint.models import JointFit
 from reconstruct.joint.result import FREELY
 from reconstruct.video import Video
 
+MANY = 3.0
+"""Times as many tracks: of a plain oven's door 194 follow a joint to 0.06 px, where off the hand 48 had to 0.12."""
 SHOW_NONE = "points off the hands show no joint, up to the hands' rims"
 LEAVE_OPEN = "points off the hands leave the axis open, up to the hands' rims"
 
@@ -25,7 +27,8 @@ def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Han
     if that is sure or, of an open one, knows the axis better; doubtful in any case.
 
     One that contradicts an open one, which may rest on more than points, has to know the axis AS_WELL times better than
-    that as it is stated: what slides along rims agrees as well. Not where a body that is carried freely refutes the
+    that as it is stated: what slides along rims agrees as well. Of the same type it counts too, however well it knows
+    the axis, if MANY times as many tracks follow it more exactly. Not where a body that is carried freely refutes the
     joint, nor before a camera that moves.
 
     Args:
@@ -45,4 +48,7 @@ def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Han
     if found.verdict == "refused" or "axis_deg" not in found.std:
         return tracks, fit
     least = AS_WELL * FACTOR if contradicts(fit, found) else 1.0
-    return (closer, doubtful(found, LEAVE_OPEN)) if least * alone_deg(found) < alone_deg(fit) else (tracks, fit)
+    better = least * alone_deg(found) < alone_deg(fit) or (
+        found.type == fit.type and found.inliers > MANY * fit.inliers and found.residual_px < fit.residual_px
+    )
+    return (closer, doubtful(found, LEAVE_OPEN)) if better else (tracks, fit)

@@ -36,6 +36,10 @@ def joint(verdict: str, axis_deg: float, type: str = "revolute", axis=(0, 0, 1.0
                     std={"axis_deg": axis_deg, "point_m": 0.01})  # fmt: skip
 
 
+def followed(count: int, residual_px: float, fit: JointFit) -> JointFit:
+    return replace(fit, inliers=count, residual_px=residual_px)
+
+
 def never(*_) -> None:
     raise AssertionError("points were followed again")
 
@@ -67,7 +71,8 @@ def test_nothing_is_asked_where_no_hand_is_or_the_camera_moves():
     "fit, found",
     [(REFUSED, joint("ok", 6.0)), (joint("ambiguous", 30.0), joint("ok", 6.0)),
      (joint("ambiguous", 30.0), joint("ambiguous", 15.0)),
-     (joint("ambiguous", 30.0), joint("ok", 9.0, axis=(1.0, 0, 0)))],
+     (joint("ambiguous", 30.0), joint("ok", 9.0, axis=(1.0, 0, 0))),
+     (followed(48, 0.12, joint("ambiguous", 20.0)), followed(194, 0.06, joint("ambiguous", 40.0, axis=(1.0, 0, 0))))],
 )  # fmt: skip
 def test_what_points_up_to_the_rims_show_counts_and_is_doubtful(fit, found):
     used, answer = given(fit, found)
@@ -83,7 +88,10 @@ def test_what_points_up_to_the_rims_show_counts_and_is_doubtful(fit, found):
     [(REFUSED, REFUSED), (REFUSED, joint("ambiguous", 6.0)), (joint("ambiguous", 30.0), REFUSED),
      (joint("ambiguous", 30.0), joint("ambiguous", 40.0)),
      (joint("ambiguous", 20.0), joint("ok", 9.0, axis=(1.0, 0, 0))),
-     (joint("ambiguous", 20.0), joint("ok", 9.0, "prismatic"))],
+     (joint("ambiguous", 20.0), joint("ok", 9.0, "prismatic")),
+     (followed(48, 0.12, joint("ambiguous", 20.0)), followed(194, 0.06, joint("ok", 9.0, "prismatic"))),
+     (followed(48, 0.12, joint("ambiguous", 20.0)), followed(140, 0.06, joint("ambiguous", 40.0))),
+     (followed(48, 0.12, joint("ambiguous", 20.0)), followed(194, 0.13, joint("ambiguous", 40.0)))],
 )  # fmt: skip
 def test_what_they_know_no_better_does_not(fit, found):
     assert given(fit, found) == (FIRST, fit)
