@@ -13,6 +13,8 @@ APART_STDS = 2.0
 """Standard deviations of their axes by which two joints contradict each other."""
 AS_WELL = 1.5
 """Ratio of what two joints state of their axes up to which these are known alike."""
+WHOLE = 0.99
+"""A state that is stated to such a share of the stroke is not known at all."""
 FACTOR = 2.0
 """How many times what is stated joints are off that are taken for want of a better one (the root of the mean square of
 nine rendered ones by straight edges, 0.1 to 3.6; 1.2 of fourteen by points up to hands' rims, 0.02 to 3.1)."""
@@ -63,6 +65,18 @@ def alone_deg(fit: JointFit) -> float:
 def is_open(fit: JointFit) -> bool:
     """Whether a joint is doubtful and its axis known to VAGUE_DEG or worse by its tracks alone."""
     return fit.verdict == "ambiguous" and "axis_deg" in fit.std and alone_deg(fit) > VAGUE_DEG
+
+
+def open_states_told(fit: JointFit) -> JointFit:
+    """The joint, its reason saying in how many frames nothing holds the state: it is stated to the whole stroke there,
+    and the range may be another."""
+    if fit.verdict == "refused" or fit.q is None or "q" not in fit.std:
+        return fit
+    count = int(np.sum(np.asarray(fit.std["q"]) >= WHOLE * np.ptp(fit.q)))
+    if not count:
+        return fit
+    words = f"in {count} of {len(fit.q)} frames nothing holds the state to the first one's: the range may be another"
+    return replace(fit, reason=f"{fit.reason}; {words}")
 
 
 def doubtful(fit: JointFit, words: str) -> JointFit:
