@@ -85,7 +85,8 @@ LIKELY = 0.1
 
 @dataclass(frozen=True)
 class Rival:
-    """Another joint of the same type that explains the motion too: how far off its axis is, and how probable it is."""
+    """Another joint of the same type that explains the motion too, with states in all frames, how far off its axis is,
+    and how probable it is."""
 
     apart_deg: float
     probability: float
