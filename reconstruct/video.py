@@ -24,6 +24,8 @@ MAX_WORK_RATE = 31.0
 """Frames a second; a little over 30 so that the jitter of a 30 Hz clip drops nothing."""
 SETTLE_SECONDS = 0.5
 """Cameras hunt for exposure and decoders lack references only at the very start."""
+TAIL_SHARE = 0.1
+"""What follows a cut in the last half second, and in this share of the frames, is another shot's or broken."""
 LONGEST_GAP = 60.0
 """s; a longer one between two frames, far beyond the clip's usual spacing, is a broken time stamp."""
 FLAT_GREY = 2.0
@@ -97,7 +99,8 @@ def load_video(
     """Decode a video into working frames.
 
     Only one full-size frame is in memory at a time: working frames go straight to a memory-mapped
-    file. Leading frames before the decoder and the camera's exposure have settled are dropped.
+    file. Leading frames before the decoder and the camera's exposure have settled are dropped, and what
+    follows a cut at the very end.
 
     Args:
         path: video file.
@@ -177,6 +180,9 @@ def load_video(
     if len(index) < 2:
         raise TaaError(f"fewer than two settled frames in {path}; export the video again")
     cut = find_cut(frames, np.asarray(thumbs[first:]))
+    if cut is not None and _is_tail(time[index], cut):
+        notes.append(f"{len(index) - cut} frames after a cut at the very end dropped")
+        frames, index, cut = frames[:cut], index[:cut], None
     if cut is not None:
         raise Refused(
             f"the camera cuts at {time[index[cut]]:.2f} s; give one unbroken shot (trim the video there and try again)"
@@ -258,6 +264,11 @@ def find_cut(frames: np.ndarray, thumbs: np.ndarray) -> int | None:
         if _trackable(frames[i], frames[i + 1]) < 0.2:
             return int(i) + 1
     return None
+
+
+def _is_tail(time: np.ndarray, cut: int) -> bool:
+    """Whether frames from ``cut`` on are but the end of those at (T,) times, s."""
+    return bool(time[-1] - time[cut] <= SETTLE_SECONDS and len(time) - cut <= TAIL_SHARE * len(time))
 
 
 def _trackable(a: np.ndarray, b: np.ndarray) -> float:

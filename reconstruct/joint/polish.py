@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.normal import Normal, normal_equations
 from reconstruct.joint.paths import held
-from reconstruct.joint.shape import Flat, Reach
+from reconstruct.joint.shape import Flat, Nearby, Reach
 from reconstruct.joint.twist import Twist
 
 BEND = 0.1
@@ -198,7 +198,7 @@ class _Priors:
         ends: the frames with the least and the most path of those that tracks hold. Measured from the first frame,
             which may show nothing of the link, a hinge would get its radius by a path that nothing contradicts.
         reach: of the link's points.
-        flat: of the same.
+        flat: of the same.  nearby: of the resting scene's.
         along, parallel: what the axis is parallel to, and the weight of the sine of the angle between them.
     """
 
@@ -209,6 +209,7 @@ class _Priors:
     ends: tuple[int, int]
     reach: Reach
     flat: Flat
+    nearby: Nearby
     along: np.ndarray | None = None
     parallel: float = 0.0
 
@@ -233,12 +234,12 @@ class _Priors:
         ends = int(held[np.argmin(b.q[held])]), int(held[np.argmax(b.q[held])])
         path = float(b.q[ends[1]] - b.q[ends[0]])
         size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
-        reach, flat = Reach.of(b, s, sigma), Flat.of(b, s, sigma)
+        reach, flat, nearby = Reach.of(b, s, sigma), Flat.of(b, s, sigma), Nearby.of(b, s, sigma)
         if b.kind == "prismatic" or s.link is not None or path <= 0 or size <= 0:
-            return cls(focal, bend, 0.0, 0.0, ends, reach, flat, s.along, parallel)
+            return cls(focal, bend, 0.0, 0.0, ends, reach, flat, nearby, s.along, parallel)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
         log_turn = float(np.log(path / (HINGE_RADIUS * size)))
-        return cls(focal, bend, radius, log_turn, ends, reach, flat, s.along, parallel)
+        return cls(focal, bend, radius, log_turn, ends, reach, flat, nearby, s.along, parallel)
 
     def cost(self, b: Bundle) -> float:
         """Without the radius, which is weighed apart where types are compared."""
@@ -247,7 +248,7 @@ class _Priors:
 
     def of_points(self, b: Bundle) -> float:
         """Of where the points lie."""
-        return self.reach.cost(b.X) + self.flat.cost(b)
+        return self.reach.cost(b.X) + self.flat.cost(b) + self.nearby.cost(b.X)
 
     def radius_cost(self, b: Bundle) -> float:
         """Of the radius alone."""
@@ -272,9 +273,9 @@ class _Priors:
             J = np.cross(self.along, b.twist.axis_by_step(n.Z), axisb=0).T
             n.H[:G, :G] += self.parallel * J.T @ J
             n.g[:G] += self.parallel * J.T @ np.cross(self.along, b.twist.axis)
-        H, g = self.reach.slopes(b.X)
-        n.Hp[...] += H
-        n.gp[...] += g
+        for H, g in (self.reach.slopes(b.X), self.nearby.slopes(b.X)):
+            n.Hp[...] += H
+            n.gp[...] += g
         self.flat.add(n, b)
         k2 = float(b.twist.curvature @ b.twist.curvature)
         if self.radius and k2 > 0:

@@ -1,6 +1,6 @@
-"""What is known of where a link's points lie: near each other, and of a plate in one plane.
+"""What is known of where points lie: a link's near each other, of a plate in one plane, and what rests near the link.
 
-Both are squares in px^2 beside those of the pictures, so that a standard deviation of each weighs as one of the noise.
+All are squares in px^2 beside those of the pictures, so that a standard deviation of each weighs as one of the noise.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 REACH = 1.5
 """Link sizes from the middle up to which a point may lie anywhere."""
+NEARBY, BEYOND = 4.0, 0.05
+"""Depth of a resting scene over the link's up to which, or down to one over it, it may lie anywhere; and the standard
+deviation of the logarithm beyond."""
 
 
 @dataclass(frozen=True)
@@ -111,3 +114,45 @@ class Flat:
         n.g[:G] += scores.sum(0)
         n.scores[:, :G] += scores
         n.C[:G] += weighted.T[:, :, None] * b.twist.axis
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """How far the resting scene before a moving camera lies before or behind the link.
+
+    What holds the camera's path holds its steps over the scene's depth alone. With the scene at infinity a camera at
+    rest goes as far as it likes, and along with a joint of the wrong type until nothing contradicts that.
+
+    Attributes:
+        unit: depth of the link.  weight: (N,) px^2 over a squared logarithm, 0 of the link's points.
+    """
+
+    unit: float
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, b: Bundle, s: Sightings, sigma: float) -> Nearby:
+        """Of the points of N tracks; sigma: noise of the link's, px."""
+        if s.link is None or s.link.all():
+            return cls(1.0, np.zeros(0))
+        unit = max(float(np.median(b.X[s.link, 2])), 1e-9)
+        return cls(unit, np.where(s.link, 0.0, s.lasting * (sigma / BEYOND) ** 2 / np.sum(~s.link)))
+
+    def _beyond(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) depths, and by how much their logarithms are out of bounds."""
+        z = np.maximum(X[:, 2], 1e-6 * self.unit)
+        log = np.log(z / self.unit)
+        return z, np.sign(log) * np.maximum(np.abs(log) - np.log(NEARBY), 0.0)
+
+    def cost(self, X: np.ndarray) -> float:
+        """Of points (N, 3) in the first camera's frame, px^2."""
+        return float(self.weight @ self._beyond(X)[1] ** 2) if len(self.weight) else 0.0
+
+    def slopes(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3, 3) and (N, 3) of half the cost by the points."""
+        H, g = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3))
+        if len(self.weight):
+            z, off = self._beyond(X)
+            H[:, 2, 2] = self.weight * (off != 0) / z**2
+            g[:, 2] = self.weight * off / z
+        return H, g

@@ -11,6 +11,9 @@ from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.handheld import filmed, path_from_rest
 from reconstruct.joint.models import joint_transform
+from reconstruct.joint.polish import Bundle, Sightings, polish
+from reconstruct.joint.shape import NEARBY, Nearby
+from reconstruct.joint.twist import Twist
 from tests.reconstruct.joint_scenes import FOCAL, H, W, make_video, project
 
 CENTRE = np.array([(W - 1) / 2, (H - 1) / 2])
@@ -110,3 +113,40 @@ def test_what_is_carried_before_a_hand_held_camera_is_refused():
     tracks, warp, _, _ = scene(body="carried")
     fit = fit_joint(replace(make_video(FRAMES), warp=warp), tracks, FOCAL, camera_moving=False)
     assert fit.verdict == "refused", fit.type_probability
+
+
+def test_what_rests_stays_near_a_link_of_the_wrong_type():
+    """A door's tracks as a slide's: with the scene at infinity the camera could go wherever the swing needs it."""
+    tracks, _, (R, t), q = scene(noise=0.05)
+    uv = tracks.uv.astype(float) - CENTRE
+    link = np.arange(len(uv)) >= 160
+    pose = joint_transform("revolute", AXIS, POINT, -q)
+    rng = np.random.default_rng(0)
+    door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (45, 3))
+    swing = np.einsum("tij,j->ti", pose[:, :3, :3], door.mean(0)) + pose[:, :3, 3] - door.mean(0)
+    chord = swing[-1] / np.linalg.norm(swing[-1])
+    X = np.concatenate([uv[:, 0] / FOCAL, np.ones((len(uv), 1))], axis=1)
+    slide = Bundle("prismatic", Twist(np.median(X[link], axis=0), chord, np.zeros(3)), swing @ chord, X, R=R, t=t)
+    relative = np.where(link, 1.0, 0.2)
+    s = Sightings(uv, tracks.visible, np.ones(len(uv)), FOCAL, R=R, t=t, link=link, relative=relative, free=True,
+                  lasting=40.0)
+    last = polish(slide, s, iterations=40)
+    ratio = np.median(last.X[~link, 2]) / np.median(last.X[link, 2])
+    assert 1 / NEARBY / 1.5 < ratio < 1.5 * NEARBY
+
+
+def test_a_scene_is_called_back_from_beyond():
+    X = np.array([[0, 0, 1.0], [0.1, 0, 1.1], [0, 0.2, 0.9], [0, 0, 0.1], [0.3, 0, 2.0], [0, 0, 9.0]])
+    b = Bundle("prismatic", Twist(np.zeros(3), np.array([1.0, 0, 0]), np.zeros(3)), np.zeros(4), X)
+    s = Sightings(np.zeros((6, 4, 2)), np.ones((6, 4), bool), np.ones(6), FOCAL, link=np.arange(6) < 3)
+    near = Nearby.of(b, s, 0.3)
+    H, g = near.slopes(b.X)
+    assert near.unit == 1.0 and not g[[0, 1, 2, 4]].any() and g[3, 2] < 0 < g[5, 2]
+    h = 1e-6
+    for k in (3, 5):
+        step = np.zeros_like(b.X)
+        step[k, 2] = h
+        slope = (near.cost(b.X + step) - near.cost(b.X - step)) / (4 * h)
+        assert slope == pytest.approx(g[k, 2], rel=1e-4)
+        assert H[k, 2, 2] > 0 == np.count_nonzero(H[k]) - 1
+    assert Nearby.of(b, replace(s, link=None), 0.3).cost(b.X) == 0

@@ -135,6 +135,13 @@ def test_camera_cut_is_one_clear_line(tmp_path):
         load_video(write(tmp_path / "cut.mp4", frames))
 
 
+def test_what_follows_a_cut_at_the_very_end_is_dropped(tmp_path):
+    frames = [with_disc(scene(0), i) for i in range(40)] + [with_disc(scene(9), i) for i in range(3)]
+    video = load_video(write(tmp_path / "tail.mp4", frames))
+    assert video.index[-1] == 39 and len(video) == len(video.frames) == 40
+    assert "3 frames after a cut at the very end dropped" in video.notes
+
+
 @pytest.mark.parametrize("what", ["flash", "pan", "passing hand"])
 def test_what_is_not_a_cut(tmp_path, what):
     wide = scene(0, 180, 1400)

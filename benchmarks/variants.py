@@ -1,0 +1,197 @@
+"""Real clips once more: mirrored, played backwards, smaller, at half the rate, compressed, darker.
+
+    python -m benchmarks.variants                                   # every clip and variant, two at a time
+    python -m benchmarks.variants --only suitcase.mp4 --kinds mirrored backwards
+    python -m benchmarks.variants --workers 16 --out rows.jsonl     # a line a run, written as it ends
+
+What was found must not hang on any of that. There are few real clips, and all were looked at while the project was
+built: their variants give other corners, other orders of draws and other frames to begin from. Each goes from its
+pixels to its joint (no asset is built) and is scored against the clip's annotation, which is changed the same way. The
+files are lossless.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.clips import REAL, annotations, image_errors
+
+KINDS = ("as it is", "mirrored", "backwards", "smaller", "half rate", "compressed", "darker")
+SMALLER = 2 / 3
+"""Of width and height."""
+QUALITY = 25
+"""Of JPEG, each frame by itself: what messengers leave of a video."""
+DARKER = 0.4
+"""Of the grey values, rounded: as many levels are gone."""
+
+
+def change(frames: np.ndarray, fps: float, kind: str) -> tuple[np.ndarray, float]:
+    """The (T, h, w, 3) frames of a variant and its frames a second.
+
+    Raises:
+        ValueError: no such kind.
+    """
+    import cv2
+
+    if kind == "as it is":
+        return frames, fps
+    if kind == "mirrored":
+        return frames[:, :, ::-1], fps
+    if kind == "backwards":
+        return frames[::-1], fps
+    if kind == "smaller":
+        size = (round(frames.shape[2] * SMALLER), round(frames.shape[1] * SMALLER))
+        return np.stack([cv2.resize(f, size, interpolation=cv2.INTER_AREA) for f in frames]), fps
+    if kind == "half rate":
+        return frames[::2], fps / 2
+    if kind == "compressed":
+        packed = (cv2.imencode(".jpg", f, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1] for f in frames)
+        return np.stack([cv2.imdecode(p, cv2.IMREAD_COLOR) for p in packed]), fps
+    if kind == "darker":
+        return np.stack([np.round(f * DARKER).astype(np.uint8) for f in frames]), fps
+    raise ValueError(f"no variant {kind!r}; there are {', '.join(KINDS)}")
+
+
+def change_truth(truth: dict, kind: str) -> dict:
+    """The annotation of a variant, in the format of the clip's own."""
+    out = dict(truth)
+    if kind == "mirrored":
+        for key in ("axis_line", "direction"):
+            if truth.get(key):
+                out[key] = [[1 - x, y] for x, y in truth[key]]
+        if truth.get("axis_point"):
+            out["axis_point"] = [1 - truth["axis_point"][0], truth["axis_point"][1]]
+    elif kind == "backwards" and truth.get("direction"):
+        out["direction"] = truth["direction"][::-1]
+    elif kind == "smaller":
+        out |= {"width": round(truth["width"] * SMALLER), "height": round(truth["height"] * SMALLER)}
+    return out
+
+
+def write_video(file: Path, frames: np.ndarray, fps: float) -> None:
+    """Lossless, so that a variant's pixels are the clip's.
+
+    Raises:
+        RuntimeError: OpenCV's video writer cannot.
+    """
+    import cv2
+
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"FFV1"), fps, frames.shape[2:0:-1])
+    if not writer.isOpened():
+        raise RuntimeError(f"OpenCV cannot write {file.name} as FFV1")
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame))
+    writer.release()
+
+
+def run(name: str, kind: str) -> dict[str, Any]:
+    """One row: clip, kind, verdict, type, probability, range (deg or m), errors in the picture, reason, seconds."""
+    import cv2
+
+    from reconstruct.container import open_video
+    from reconstruct.errors import Refused, TaaError
+    from reconstruct.pipeline import Silent, Stages, look
+    from reconstruct.video import load_video
+
+    cv2.setNumThreads(1)
+    truth = change_truth(annotations()[name], kind)
+    row: dict[str, Any] = {"clip": name, "kind": kind, "truth": truth["joint"]}
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="taa-variant-") as scratch:
+        path = REAL / name
+        if kind != "as it is":
+            capture, frames = open_video(path), []
+            fps = capture.get(cv2.CAP_PROP_FPS)
+            while True:
+                more, frame = capture.read()
+                if not more:
+                    break
+                frames.append(frame)
+            capture.release()
+            path = Path(scratch) / "variant.avi"
+            write_video(path, *change(np.stack(frames), fps, kind))
+            del frames
+        try:
+            video = load_video(path, Path(scratch))
+            fit = look(video, None, None, 0, Stages(None, Silent(), {"seed": 0}), Path(scratch)).fit
+        except (Refused, TaaError) as error:
+            verdict = "refused" if isinstance(error, Refused) else "error"
+            return row | {"verdict": verdict, "reason": str(error), "seconds": time.monotonic() - begin}
+        row |= {"verdict": fit.verdict, "type": fit.type, "reason": fit.reason}
+        if fit.verdict != "refused":
+            span = float(np.ptp(fit.q))
+            row |= {"probability": fit.type_probability, "stated": float(fit.std["axis_deg"]),
+                    "tracks": len(fit.point_track),
+                    "range": span if fit.type == "prismatic" else float(np.degrees(span))}  # fmt: skip
+            row |= image_errors(np.asarray(fit.image_line), truth)
+    return row | {"seconds": time.monotonic() - begin}
+
+
+def cell(row: dict[str, Any]) -> str:
+    """A row in one cell of the table."""
+    if row["verdict"] in ("refused", "error"):
+        right = row["truth"] == "none" and row["verdict"] == "refused"
+        return row["verdict"] + ("" if right else " (wrong)")
+    words = [row["type"] + (" (ambiguous)" if row["verdict"] == "ambiguous" else "")]
+    if row["type"] != row["truth"]:
+        words[0] += " (wrong)"
+    if row["type"] != "prismatic":
+        words.append(f"{row['range']:.0f} deg")
+    if "angle_deg" in row:
+        words.append(f"{row['angle_deg']:.1f} deg off")
+    if "distance" in row:
+        words.append(f"{row['distance']:.1%}")
+    return ", ".join(words)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: a line a clip, a column a variant."""
+    kinds = [k for k in KINDS if any(r["kind"] == k for r in rows)]
+    lines = ["| clip | truth | " + " | ".join(kinds) + " |", "|" + " --- |" * (2 + len(kinds))]
+    for name in dict.fromkeys(r["clip"] for r in rows):
+        mine = {r["kind"]: r for r in rows if r["clip"] == name}
+        truth = next(iter(mine.values()))["truth"]
+        lines.append(f"| {name} | {truth} | " + " | ".join(cell(mine[k]) if k in mine else "" for k in kinds) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table; rows go to stderr, and to a file, as they come."""
+    import sys
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", help="clips to run")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="file that rows are appended to, a line of JSON each")
+    arguments = parser.parse_args()
+    known = annotations()
+    if not known:
+        parser.error(f"no annotated clips in {REAL}")
+    if unknown := [name for name in arguments.only or () if name not in known]:
+        parser.error(f"no clip {unknown[0]!r}; there are {', '.join(known)}")
+    names = arguments.only or list(known)
+    rows = []
+    with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
+        for job in as_completed([pool.submit(run, name, kind) for kind in arguments.kinds for name in names]):
+            rows.append(job.result())
+            line = json.dumps(rows[-1], default=float)
+            print(line, file=sys.stderr, flush=True)
+            if arguments.out:
+                with arguments.out.open("a", encoding="utf-8") as f:
+                    f.write(line + "\n")
+    rows.sort(key=lambda r: (names.index(r["clip"]), KINDS.index(r["kind"])))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
