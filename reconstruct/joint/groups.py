@@ -19,6 +19,9 @@ from reconstruct.joint.paths import held, linked_frames
 from reconstruct.joint.polish import noise
 from reconstruct.joint.twist import skew
 
+DAMPINGS = 10
+"""Times ten, from next to none, in one step of an adjustment: a far start (a hinge for a body that is carried freely)
+needs many, and without them that body was taken to follow no better."""
 MIN_GROUP = 15
 KEYS = 20
 SEEDS = 18
@@ -501,7 +504,7 @@ def adjust(x, seen, R, t, X, focal, iterations: int = 8, slip=None):
         Hx = np.einsum("nt,ntia,ntib->nab", w, Jx, Jx, optimize=True)
         gx = np.einsum("nt,ntia,nti->na", w, Jx, r, optimize=True)
         C = np.swapaxes(wJc, -1, -2) @ Jx  # (N, T, 6, 3)
-        for _ in range(4):
+        for _ in range(DAMPINGS):
             inv = np.linalg.inv(Hx + (damping * np.einsum("nii->ni", Hx) + 1e-9)[..., None] * np.eye(3))
             flat = C.reshape(N, 6 * T, 3)
             CI = flat @ inv

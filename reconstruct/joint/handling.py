@@ -27,8 +27,8 @@ whenever it goes (0.03 to 0.10)."""
 
 def unless_carried(fit: JointFit, video: Video, tracks: Tracks, hands: Hands, ask: Callable[[Tracks], JointFit]
                    ) -> JointFit:  # fmt: skip
-    """The joint, or where a body that is carried freely refutes it the sure one that is found without what the hands
-    carry, if its part rests for RESTS of the way of the hand that carries most; doubtful, as few films have shown it.
+    """The joint, or where a body that is carried freely refutes it the one that is found without what the hands carry,
+    if its part rests for RESTS of the way of the hand that carries most; doubtful, as few films have shown it.
 
     Args:
         fit: the joint of these tracks, or a refusal.
@@ -41,7 +41,7 @@ def unless_carried(fit: JointFit, video: Video, tracks: Tracks, hands: Hands, as
     if not held.any():
         return fit
     again = ask(without(tracks, held.any(0)))
-    if again.verdict != "ok" or again.moving_frames is None:
+    if again.verdict == "refused" or again.moving_frames is None:
         return fit
     way = path_px(hands.tracks[int(np.argmax(held.sum(1)))])
     rests = ~(again.moving_frames[1:] | again.moving_frames[:-1])
