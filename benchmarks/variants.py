@@ -1,4 +1,4 @@
-"""Real clips once more: mirrored, played backwards, smaller, at half the rate, compressed, darker.
+"""Real clips once more: mirrored, played backwards, smaller, at half the rate, compressed, darker, shaken.
 
     python -m benchmarks.variants                                   # every clip and variant, two at a time
     python -m benchmarks.variants --only suitcase.mp4 --kinds mirrored backwards
@@ -25,13 +25,18 @@ import numpy as np
 
 from benchmarks.clips import REAL, annotations, image_errors
 
-KINDS = ("as it is", "mirrored", "backwards", "smaller", "half rate", "compressed", "darker")
+KINDS = ("as it is", "mirrored", "backwards", "smaller", "half rate", "compressed", "darker", "shaken")
 SMALLER = 2 / 3
 """Of width and height."""
 QUALITY = 25
 """Of JPEG, each frame by itself: what messengers leave of a video."""
 DARKER = 0.4
 """Of the grey values, rounded: as many levels are gone."""
+SWAY_DEG, MARGIN = 2.0, 0.06
+"""By which a camera in a hand turns to and fro about each axis at most, and what is cut off for it at each side, of the
+longer one."""
+FOCAL = 0.8
+"""Of a shaken clip's camera, over the longer side."""
 
 
 def change(frames: np.ndarray, fps: float, kind: str) -> tuple[np.ndarray, float]:
@@ -58,7 +63,34 @@ def change(frames: np.ndarray, fps: float, kind: str) -> tuple[np.ndarray, float
         return np.stack([cv2.imdecode(p, cv2.IMREAD_COLOR) for p in packed]), fps
     if kind == "darker":
         return np.stack([np.round(f * DARKER).astype(np.uint8) for f in frames]), fps
+    if kind == "shaken":
+        return shaken(frames, fps), fps
     raise ValueError(f"no variant {kind!r}; there are {', '.join(KINDS)}")
+
+
+def margin(width: int, height: int) -> int:
+    """px that a shaken picture lacks at each side."""
+    return round(MARGIN * max(width, height))
+
+
+def shaken(frames: np.ndarray, fps: float) -> np.ndarray:
+    """The (T, h, w, 3) frames as a camera sees them that a hand holds: it turns, and does not go anywhere, by slow and
+    quick sways (0.4 to 3 Hz) from its first direction on."""
+    import cv2
+    from scipy.spatial.transform import Rotation
+
+    T, h, w = frames.shape[:3]
+    cut, rng, t = margin(w, h), np.random.default_rng(0), np.arange(T) / fps
+    sway = sum(rng.normal(size=3) * np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6, 3)) / f for f in (0.4, 1, 3))
+    sway = sway - sway[0]
+    turn = Rotation.from_rotvec(np.radians(SWAY_DEG) * sway / np.abs(sway).max()).as_matrix()
+    K = np.array([[FOCAL * max(w, h), 0, (w - 1) / 2], [0, FOCAL * max(w, h), (h - 1) / 2], [0, 0, 1]])
+    shift = np.array([[1.0, 0, -cut], [0, 1, -cut], [0, 0, 1]])
+    size = (w - 2 * cut, h - 2 * cut)
+    return np.stack([
+        cv2.warpPerspective(f, shift @ K @ R @ np.linalg.inv(K), size, flags=cv2.INTER_CUBIC)
+        for f, R in zip(frames, turn, strict=True)
+    ])  # fmt: skip
 
 
 def change_truth(truth: dict, kind: str) -> dict:
@@ -74,6 +106,13 @@ def change_truth(truth: dict, kind: str) -> dict:
         out["direction"] = truth["direction"][::-1]
     elif kind == "smaller":
         out |= {"width": round(truth["width"] * SMALLER), "height": round(truth["height"] * SMALLER)}
+    elif kind == "shaken":
+        size = np.array([truth["width"], truth["height"]])
+        cut = margin(*size)
+        out |= {"width": int(size[0]) - 2 * cut, "height": int(size[1]) - 2 * cut}
+        for key in ("axis_line", "axis_point", "direction"):
+            if truth.get(key):
+                out[key] = ((np.array(truth[key]) * size - cut) / (size - 2 * cut)).tolist()
     return out
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clips import annotations, image_errors
-from benchmarks.variants import KINDS, cell, change, change_truth, run, table, write_video
+from benchmarks.variants import KINDS, cell, change, change_truth, margin, run, table, write_video
 
 SHAPE = (7, 60, 90, 3)
 
@@ -26,6 +26,10 @@ def test_a_variant_is_the_clip_but_for_what_its_name_says(frames):
     smooth = np.broadcast_to(np.linspace(0, 200, 90).astype(np.uint8)[:, None], SHAPE)
     off = np.abs(change(smooth, 30.0, "compressed")[0].astype(int) - smooth)
     assert off.any() and off.mean() < 6
+    cut = margin(90, 60)
+    held = change(smooth, 30.0, "shaken")[0]
+    np.testing.assert_array_equal(held[0], smooth[0, cut:-cut, cut:-cut])
+    assert (held[1:] != held[0]).any() and held[1:].min() > 0  # nothing from beyond the picture
     with pytest.raises(ValueError, match="no variant 'upside down'; there are as it is, mirrored"):
         change(frames, 30.0, "upside down")
 
@@ -44,12 +48,17 @@ def test_the_annotation_goes_along(truth, kind):
             line = [90, 0] + line * [-1, 1]
         if kind == "backwards" and "direction" in truth:
             line = line[::-1]
+        if kind == "shaken":
+            line = line - margin(90, 60)
         return line * 2 / 3 if kind == "smaller" else line
 
     for off in (0.0, 6.0):
         line = drawn + [[0, 0], [0, off]]
         found = image_errors(of_variant(line), change_truth(truth, kind))
-        assert found == pytest.approx(image_errors(line, truth), abs=1e-4)
+        wanted = image_errors(line, truth)
+        if kind == "shaken" and "distance" in wanted:  # of a smaller picture
+            wanted["distance"] *= np.hypot(90, 60) / np.hypot(90 - 2 * margin(90, 60), 60 - 2 * margin(90, 60))
+        assert found == pytest.approx(wanted, abs=1e-4)
     assert truth["width"] == 90
 
 
