@@ -29,18 +29,21 @@ KINDS = ("as it is", "mirrored", "backwards", "smaller", "half rate", "compresse
 SMALLER = 2 / 3
 """Of width and height."""
 QUALITY = 25
-"""Of JPEG, each frame by itself: what messengers leave of a video."""
+"""Of JPEG, each frame by itself."""
 DARKER = 0.4
-"""Of the grey values, rounded: as many levels are gone."""
+"""Of the grey values, rounded: three of five levels are gone."""
 SWAY_DEG, MARGIN = 2.0, 0.06
-"""By which a camera in a hand turns to and fro about each axis at most, and what is cut off for it at each side, of the
-longer one."""
+"""By which a camera in a hand turns to and fro about each axis at most, deg, and what is cut off for it at each side,
+over the longer one."""
 FOCAL = 0.8
-"""Of a shaken clip's camera, over the longer side."""
+"""Focal length of a shaken clip's camera, over the longer side."""
 
 
 def change(frames: np.ndarray, fps: float, kind: str) -> tuple[np.ndarray, float]:
-    """The (T, h, w, 3) frames of a variant and its frames a second.
+    """A variant's frames, (T', h', w', 3), and how many of them there are a second.
+
+    Args:
+        frames: (T, h, w, 3) uint8 BGR of the clip.  fps: of them a second.  kind: one of KINDS.
 
     Raises:
         ValueError: no such kind.
@@ -74,8 +77,15 @@ def margin(width: int, height: int) -> int:
 
 
 def shaken(frames: np.ndarray, fps: float) -> np.ndarray:
-    """The (T, h, w, 3) frames as a camera sees them that a hand holds: it turns, and does not go anywhere, by slow and
-    quick sways (0.4 to 3 Hz) from its first direction on."""
+    """The clip as a camera sees it that a hand holds: it turns, and does not go anywhere, by slow and quick sways (0.4
+    to 3 Hz) from its first direction on.
+
+    Args:
+        frames: (T, h, w, 3) uint8.  fps: of them a second.
+
+    Returns:
+        (T, h - 2 m, w - 2 m, 3) with m of :func:`margin`; the first is the clip's without its rim.
+    """
     import cv2
     from scipy.spatial.transform import Rotation
 
@@ -117,7 +127,7 @@ def change_truth(truth: dict, kind: str) -> dict:
 
 
 def write_video(file: Path, frames: np.ndarray, fps: float) -> None:
-    """Lossless, so that a variant's pixels are the clip's.
+    """(T, h, w, 3) uint8 BGR frames as FFV1, which is lossless, so that a variant's pixels are the clip's.
 
     Raises:
         RuntimeError: OpenCV's video writer cannot.
@@ -213,6 +223,10 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, help="file that rows are appended to, a line of JSON each")
     arguments = parser.parse_args()
+    if arguments.workers < 1:
+        parser.error("--workers needs one at least")
+    if arguments.out and not arguments.out.parent.is_dir():
+        parser.error(f"no folder {arguments.out.parent} for --out")
     known = annotations()
     if not known:
         parser.error(f"no annotated clips in {REAL}")

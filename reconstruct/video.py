@@ -111,7 +111,7 @@ def load_video(
 
     Raises:
         TaaError: no such file, not a video, or fewer than two frames decode.
-        Refused: the video has a camera cut.
+        Refused: the video has a camera cut before its very end.
     """
     import cv2
 
