@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.articulation.bound import bound, foot, motion_jacobian, tangent
 from benchmarks.articulation.engines import Answer
-from benchmarks.articulation.motions import MOTIONS
+from benchmarks.articulation.motions import HELD_DEG, HELD_M, MOTIONS, in_a_hand, shoot
 from benchmarks.articulation.noise import LOST, OUTLIERS, give
 from benchmarks.articulation.objects import furniture, procedural
 from benchmarks.articulation.pixels import STRAY_PX, film
@@ -209,6 +210,31 @@ def test_tracks_of_rendered_pixels_lie_on_the_surfaces_they_were_seeded_on():
     # The seeds are exact by construction.
     seeds = error[np.arange(len(error)), scene.seed]
     assert np.nanmax(seeds[scene.moving]) < 0.05
+
+
+@pytest.mark.slow
+def test_a_film_from_a_hand_is_compensated_and_its_tracks_are_known_as_filmed():
+    given = film(MODELS["storage"], "open", "rich", frames=24, held=True)
+    scene, warp = given.scene, given.warp
+    assert given.row == 5 and warp is not None and given.frames is not None
+    assert scene.moving.sum() > 30
+    error = np.linalg.norm(given.filmed - scene.uv, axis=-1)
+    seeds = error[np.arange(len(error)), scene.seed]
+    assert np.nanmax(seeds[scene.moving]) < 0.05
+    # The wall too: a track of it is where the camera's path takes it.
+    assert np.nanmedian(error[~scene.moving]) < 0.5
+    # A plane's homographies cannot take out what is nearer: that is what the row is for.
+    still = np.linalg.norm(given.uv - given.uv[np.arange(len(error)), scene.seed][:, None], axis=-1)
+    assert np.nanmax(still[~scene.moving & ~given.wrong.any(1)]) > 3.0
+
+
+def test_a_camera_in_a_hand_starts_from_the_one_at_rest_and_keeps_to_its_sway():
+    shot = shoot(MODELS["storage"], "open", False, False, 40, np.random.default_rng(0))
+    held = in_a_hand(shot, 0.5, np.random.default_rng(1))
+    np.testing.assert_allclose(held.T_world_camera[0], shot.T_world_camera[0])
+    apart = np.linalg.inv(shot.T_world_camera) @ held.T_world_camera
+    assert np.linalg.norm(apart[:, :3, 3], axis=1).max() == pytest.approx(HELD_M / 0.5)
+    assert np.degrees(Rotation.from_matrix(apart[:, :3, :3]).magnitude()).max() == pytest.approx(HELD_DEG)
 
 
 @pytest.mark.parametrize(("option", "name"), [("--motions", "jump"), ("--objects", "sofa")])

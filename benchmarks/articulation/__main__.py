@@ -3,6 +3,7 @@
     python -m benchmarks.articulation --rows 1 2 --out results.json          # all objects, motions, cameras
     python -m benchmarks.articulation --rows 3 --objects laptop storage --motions open twice --cameras static
     python -m benchmarks.articulation --rows 4 --motions open twice          # rendered pixels, through the tracker
+    python -m benchmarks.articulation --rows 5 --extents full                # the same, filmed from a hand
     python -m benchmarks.articulation --table results.json                   # the table of results on disk
     python -m benchmarks.articulation --scaling scaling.png                  # cost over tracks and frames
 
@@ -40,7 +41,8 @@ class Case:
 
     @property
     def key(self) -> str:
-        parts = [f"{self.row}/{self.model}", self.motion, "orbit" if self.orbit else "static"]
+        camera = "hand" if self.row == 5 else "orbit" if self.orbit else "static"
+        parts = [f"{self.row}/{self.model}", self.motion, camera]
         return ":".join([*parts, *["small"] * self.small, *filter(None, [self.texture])])
 
 
@@ -68,8 +70,8 @@ def run(case: Case) -> dict:
     from benchmarks.articulation.scores import score
 
     try:
-        if case.row == 4:
-            given = film(_models()[case.model], case.motion, case.texture, case.small, case.seed)
+        if case.row in (4, 5):
+            given = film(_models()[case.model], case.motion, case.texture, case.small, case.seed, held=case.row == 5)
         else:
             scene = _scene(case.model, case.motion, case.orbit, case.small, case.seed)
             given = give(scene, case.row, case.seed)
@@ -90,10 +92,10 @@ def cases(args: argparse.Namespace) -> Iterator[Case]:
             for camera in args.cameras:
                 for extent in args.extents:
                     for row in args.rows:
-                        # Pixels: painted boxes before a camera that rests.
-                        if row == 4 and (camera == "orbit" or _models()[model].source != "procedural"):
+                        # Pixels: painted boxes before a camera that rests or is held in a hand.
+                        if row in (4, 5) and (camera == "orbit" or _models()[model].source != "procedural"):
                             continue
-                        for texture in TEXTURES if row == 4 else [""]:
+                        for texture in TEXTURES if row in (4, 5) else [""]:
                             yield Case(model, motion, camera == "orbit", extent == "small", row, args.seed,
                                        not args.focal_unknown, texture)  # fmt: skip
 
@@ -102,7 +104,7 @@ def main(argv: list[str] | None = None) -> int:
     from benchmarks.articulation.table import markdown, worst
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks.articulation", description=__doc__.split("\n")[0])
-    parser.add_argument("--rows", type=int, nargs="+", default=[1, 2, 3], choices=[1, 2, 3, 4])
+    parser.add_argument("--rows", type=int, nargs="+", default=[1, 2, 3], choices=[1, 2, 3, 4, 5])
     parser.add_argument("--objects", nargs="*", help="names or models; all when left out")
     parser.add_argument("--motions", nargs="*", help="open half close return pause hurry twice; all when left out")
     parser.add_argument("--cameras", nargs="+", default=["static", "orbit"], choices=["static", "orbit"])
@@ -110,7 +112,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--limit", type=int, help="only so many cases, drawn from all that were asked for")
-    parser.add_argument("--focal-unknown", action="store_true", help="rows 3, 4: do not give the focal length")
+    parser.add_argument("--focal-unknown", action="store_true", help="rows 3 to 5: do not give the focal length")
     parser.add_argument("--out", type=Path, help="JSON lines, one a case; appended to")
     parser.add_argument("--table", type=Path, help="print the table of such a file and stop")
     parser.add_argument("--scaling", type=Path, help="measure the fit's cost over tracks and frames, draw it, and stop")

@@ -44,8 +44,8 @@ class Answer:
 
 
 def solve(given: Given, best: Bound | None, focal_known: bool = True, seed: int = 0) -> Answer:
-    """Run the estimator that fits the row: with 3D tracks in rows 1 and 2, without depth in row 3; in row 4 as the
-    pipeline does, which knows where the arms are."""
+    """Run the estimator that fits the row: with 3D tracks in rows 1 and 2, without depth in row 3; in rows 4
+    and 5 as the pipeline does, which knows where the arms are."""
     begin = time.perf_counter()
     try:
         if given.depth is not None:
@@ -112,7 +112,7 @@ def _of_pixels(given: Given, hands: Hands, frames: np.ndarray, tracks: Tracks, f
     from reconstruct.pipeline import joint_off_the_arm
     from reconstruct.providers.lk_tracks import CLOSE_PX, track_points
 
-    video = video_of(frames)
+    video = video_of(frames, given.warp)
 
     def follow() -> Tracks:
         return track_points(video, hands, margin_px=CLOSE_PX)
@@ -127,14 +127,14 @@ def _of_pixels(given: Given, hands: Hands, frames: np.ndarray, tracks: Tracks, f
 def _registration(fit: JointFit, given: Given, best: Bound | None) -> tuple[float, np.ndarray] | None:
     """Scale and pose that take a fit up to scale into the true world: both see the same first camera.
 
-    The scale is the weighted median ratio of depths, true over fitted, of the moving points of the fit, in row 4 of
-    the link's surface where these were seeded; None if it has no point that is right.
+    The scale is the weighted median ratio of depths, true over fitted, of the moving points of the fit, in rows 4 and 5
+    of the link's surface where these were seeded; None if it has no point that is right.
     """
     shot, scene = given.scene.shot, given.scene
     T_world_camera = shot.T_world_camera[0]
     T_camera_fit = np.asarray(fit.T_camera_world, float)
     ratio, weight = np.ones(1), np.ones(1)
-    if fit.points is not None and fit.point_track is not None and given.row == 4:
+    if fit.points is not None and fit.point_track is not None and given.row in (4, 5):
         ratio = _ratios_at_seeds(fit, given)
         weight = np.ones(len(ratio))
     elif fit.points is not None and fit.point_track is not None:
@@ -170,7 +170,7 @@ def _ratios_at_seeds(fit: JointFit, given: Given) -> np.ndarray:
     """
     shot, model = given.scene.shot, given.scene.model
     ids = np.asarray(fit.point_track, int)
-    frame = given.scene.seed[ids]
+    frame, uv = given.scene.seed[ids], given.filmed
     T_fit, T_camera = fit.link_pose(_all_frames(fit, len(shot.q))[frame]), np.asarray(fit.T_camera_world, float)
     world = np.einsum("nij,nj->ni", T_fit[:, :3, :3], fit.points) + T_fit[:, :3, 3]
     z_fit, z_true = world @ T_camera[2, :3] + T_camera[2, 3], np.full(len(ids), np.nan)
@@ -178,7 +178,7 @@ def _ratios_at_seeds(fit: JointFit, given: Given) -> np.ndarray:
     beside = np.concatenate([np.zeros((1, 2)), RIM_PX * np.stack([np.cos(turns), np.sin(turns)], axis=1)])
     for f in np.unique(frame):
         rows, camera = np.flatnonzero(frame == f), shot.T_world_camera[f]
-        rays = pixel_rays(given.uv[ids[rows], f][:, None] + beside, shot.K, camera)
+        rays = pixel_rays(uv[ids[rows], f][:, None] + beside, shot.K, camera)
         distance, geom = model.cast(float(shot.q[f]), camera[:3, 3], rays.reshape(-1, 3))
         on = ((geom >= 0) & model.moving_geoms[geom]).reshape(len(rows), -1)
         depth = (distance.reshape(on.shape) * (rays @ camera[:3, 2]))[np.arange(len(rows)), on.argmax(1)]

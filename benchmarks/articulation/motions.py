@@ -1,10 +1,11 @@
-"""What the joint does and where the camera is: seven motions, a static and an orbiting camera."""
+"""What the joint does and where the camera is: seven motions, a static and an orbiting camera, and one in a hand."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.articulation.objects import Model
 
@@ -12,6 +13,10 @@ SIZE = (640, 480)
 FOCAL = 600.0
 SMALL_ANGLE, SMALL_SHIFT = np.radians(10.0), 0.03
 ORBIT = np.radians(50.0)
+RATE = 24
+"""Frames a second."""
+HELD_M, HELD_DEG, SWAYS_HZ = 0.02, 1.5, (0.4, 1.0, 3.0)
+"""By which a camera in a hand leaves its first place and direction at most, and how quickly it sways."""
 MOTIONS = ("open", "half", "close", "return", "pause", "hurry", "twice")
 """The seven motions; each of their key states below is (time, state) in shares of the video and of the joint's range,
 and is jittered."""
@@ -121,6 +126,25 @@ def shoot(model: Model, motion: str, orbit: bool, small: bool, frames: int, rng:
     lift = np.radians(4.0) * np.sin(2 * sweep + rng.uniform(0, 6)) * orbit
     eyes = [_eye(centre, distance, azimuths[k] + a, elevations[k] + e) for a, e in zip(sweep, lift, strict=True)]
     return Shot(q, K, np.stack([look_at(eye, centre) for eye in eyes]))
+
+
+def in_a_hand(shot: Shot, unit: float, rng: np.random.Generator) -> Shot:
+    """The motion before a camera that a hand holds: from its first pose on it goes to and fro, slowly and quickly.
+
+    Args:
+        shot: before a camera at rest.  unit: of its lengths, in m.
+    """
+    t = np.arange(len(shot.q)) / RATE
+
+    def sway() -> np.ndarray:
+        x = sum(rng.normal(size=3) * np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6, 3)) / f for f in SWAYS_HZ)
+        x = x - x[0]
+        return x / np.linalg.norm(x, axis=1).max()
+
+    T = shot.T_world_camera.copy()
+    T[:, :3, 3] += np.einsum("tij,tj->ti", T[:, :3, :3], HELD_M / unit * sway())
+    T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(np.radians(HELD_DEG) * sway()).as_matrix()
+    return replace(shot, T_world_camera=T)
 
 
 def _eye(centre: np.ndarray, distance: float, azimuth: float, elevation: float) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.articulation.motions import SIZE
 from benchmarks.articulation.scenes import Scene, rng_of
 from reconstruct.cues import Hands
+from reconstruct.joint.handheld import filmed
 
 ROWS = (1, 2, 3)
 OUTLIERS = 0.20
@@ -23,14 +24,15 @@ class Given:
     """What an estimator may see, and which of it is wrong (which it may not).
 
     Attributes:
-        scene: truth.  row: 1 perfect, 2 noisy with depth, 3 noisy without.
+        scene: truth.  row: 1 perfect, 2 noisy with depth, 3 noisy without, 4 and 5 rendered pixels.
         uv: (N, T, 2) px, NaN where not visible.  visible: (N, T) bool.
         depth: (N, T) m, NaN where not visible; None in row 3.
         link: (N,) bool, said by the masks to lie on the moving link; None in row 3.
         wrong: (N, T) bool, truth: not an observation of its point.
         sigma_px, sigma_depth (of the logarithm), sigma_field: standard deviations of the noise; zeros in row 1.
-        hands: detected ones, slip, shade, cast: of the tracks, as in :class:`Tracks`; row 4 only.
-        frames: (T, h, w, 3) uint8 BGR; row 4 only.
+        hands: detected ones, slip, shade, cast: of the tracks, as in :class:`Tracks`; rows 4 and 5 only.
+        frames: (T, h, w, 3) uint8 BGR; rows 4 and 5 only.
+        warp: (T, 3, 3) from the pictures as filmed to these, as in :class:`Video`; row 5 only.
     """
 
     scene: Scene
@@ -48,6 +50,12 @@ class Given:
     shade: np.ndarray | None = None
     cast: np.ndarray | None = None
     frames: np.ndarray | None = None
+    warp: np.ndarray | None = None
+
+    @property
+    def filmed(self) -> np.ndarray:
+        """(N, T, 2) px, the tracks in the pictures as filmed."""
+        return self.uv if self.warp is None else filmed(self.uv, self.warp)
 
 
 def field_basis(uv: np.ndarray) -> np.ndarray:

@@ -1,24 +1,28 @@
-"""Row 4: the benchmark's objects as pixels, and the tracks that the project's own tracker makes of them.
+"""Rows 4 and 5: the benchmark's objects as pixels, and the tracks that the project's own tracker makes of them.
 
 The procedural objects are painted, set before a papered wall, lit, rendered, and a hand that holds the link is rendered
 with them; hand detection and point tracking see nothing but the pictures. What is true of a track is read off the
-surface under the pixel in which it was seeded.
+surface under the pixel in which it was seeded. In row 5 the camera is held in a hand, and the pictures are compensated
+first, as the pipeline does.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from benchmarks.articulation.motions import FOCAL, SIZE, Shot, pixel_rays, shoot
+from benchmarks.articulation.motions import FOCAL, RATE, SIZE, Shot, in_a_hand, pixel_rays, shoot
 from benchmarks.articulation.noise import Given
 from benchmarks.articulation.objects import Model
 from benchmarks.articulation.scenes import Hidden, Scene, project, rng_of
 from reconstruct.cues import Tracks
+from reconstruct.joint.handheld import filmed
+from reconstruct.motion import stabilise
 from reconstruct.video import Video
 
 if TYPE_CHECKING:
@@ -28,6 +32,8 @@ TEXTURES = ("plain", "wood", "rich")
 FRAMES = 48
 DIAGONAL = 0.55
 """m, of the rendered object: everything is brought to a size that a hand can hold."""
+WALL, WALL_FRONT = 1.1, 0.03
+"""Of DIAGONAL, and m more, from the object's middle to the wall behind it."""
 STRAY_PX = 3.0
 APPROACHES = (0, 40, -40, 80, -80, 120, -120, 160, -160)
 """deg in the picture, of the direction that the hand comes from against that from below: the first that is free."""
@@ -36,11 +42,13 @@ FLESH = 0.01
 PALM_JOINTS = (0, 1, 2, 5, 6, 9, 10, 13, 14, 17, 18)
 
 
-def film(model: Model, motion: str, texture: str, small: bool = False, seed: int = 0, frames: int = FRAMES) -> Given:
+def film(model: Model, motion: str, texture: str, small: bool = False, seed: int = 0, frames: int = FRAMES,
+         held: bool = False) -> Given:  # fmt: skip
     """Tracks of one rendered clip, as an estimator is given them, with the truth about each.
 
     Args:
         model: a procedural one (boxes only).  motion, small: as in the other rows.  texture: one of TEXTURES.
+        held: the camera is held in a hand; all else is as before one at rest.
 
     Raises:
         Hidden: the hand or the object itself hides the link, or nothing was tracked.
@@ -50,35 +58,66 @@ def film(model: Model, motion: str, texture: str, small: bool = False, seed: int
 
     rng = rng_of(seed, model.name, motion, texture, "small" if small else "full")
     shot = shoot(model, motion, False, small, frames, rng)
+    if held:
+        shot = in_a_hand(shot, _scale(model, shot), rng_of(seed, model.name, motion, texture, "in a hand"))
     images = pictures(model, shot, texture, rng)
     video = video_of(np.ascontiguousarray(images[..., ::-1]))
+    if held:
+        video = _stabilised(video)
     hands = detect_hands(video)
     tracks = track_points(video, hands)
     if not len(tracks.uv):
         raise Hidden(f"{model.name}: nothing was tracked")
-    known = _known(model, motion, small, shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+    known = _known(model, motion, small, shot, tracks, video.warp)
     if (count := int(known.scene.moving.sum())) < 8:
         raise Hidden(f"{model.name}: {count} tracks were seeded on the moving link")
-    return replace(known, hands=hands, slip=tracks.slip, shade=tracks.shade, cast=tracks.cast, frames=video.frames)
+    return replace(known, row=5 if held else 4, hands=hands, slip=tracks.slip, shade=tracks.shade, cast=tracks.cast,
+                   frames=video.frames)  # fmt: skip
 
 
-def video_of(frames: np.ndarray) -> Video:
-    """A rendered clip's frames (T, h, w, 3) uint8 BGR as a video."""
+def _stabilised(video: Video) -> Video:
+    with TemporaryDirectory() as folder:
+        stable, _ = stabilise(video, Path(folder))
+        return replace(stable, frames=np.array(stable.frames))
+
+
+def _to_wall(model: Model, shot: Shot, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """(n,) distance along rays (n, 3) to the papered wall behind the object, in the model's unit."""
+    normal = shot.T_world_camera[0, :3, 2]
+    behind = _corners(model, shot).mean(0) + (WALL * DIAGONAL + WALL_FRONT) / _scale(model, shot) * normal
+    return ((behind - eye) @ normal) / (rays @ normal)
+
+
+def _corners(model: Model, shot: Shot) -> np.ndarray:
+    """(n, 3) of the object's boxes at the first state."""
+    q0 = float(shot.q[0])
+    return np.concatenate([model.corners(q0, True), model.corners(q0, False)])
+
+
+def _scale(model: Model, shot: Shot) -> float:
+    """m per unit of the model, which is brought to DIAGONAL."""
+    return DIAGONAL / float(np.linalg.norm(np.ptp(_corners(model, shot), axis=0)))
+
+
+def video_of(frames: np.ndarray, warp: np.ndarray | None = None) -> Video:
+    """A rendered clip's frames (T, h, w, 3) uint8 BGR as a video; warp: (T, 3, 3) where they are compensated."""
     T = len(frames)
-    return Video(Path("rendered.mp4"), "0" * 64, SIZE, np.arange(T) / 24, np.arange(T), T, frames, 1.0)
+    return Video(Path("rendered.mp4"), "0" * 64, SIZE, np.arange(T) / RATE, np.arange(T), T, frames, 1.0, warp=warp)
 
 
 def with_tracks(given: Given, tracks: Tracks) -> Given:
     """The clip by other tracks of its pixels."""
     s = given.scene
-    known = _known(s.model, s.motion, s.small, s.shot, tracks.uv.astype(float), tracks.visible, tracks.reference)
+    known = _known(s.model, s.motion, s.small, s.shot, tracks, given.warp)
     return replace(given, scene=known.scene, uv=known.uv, visible=known.visible, wrong=known.wrong, slip=tracks.slip,
                    shade=tracks.shade, cast=tracks.cast)  # fmt: skip
 
 
-def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, visible: np.ndarray,
-           reference: np.ndarray) -> Given:  # fmt: skip
-    """Tracks with the surface point that each was seeded on."""
+def _known(model: Model, motion: str, small: bool, shot: Shot, tracks: Tracks, warp: np.ndarray | None) -> Given:
+    """Tracks with the surface point that each was seeded on; warp: of the pictures that they are tracks of."""
+    visible, reference = tracks.visible, tracks.reference
+    given_uv = np.where(visible[..., None], tracks.uv.astype(float), np.nan)
+    uv = tracks.uv.astype(float) if warp is None else filmed(tracks.uv.astype(float), warp)
     N, T = visible.shape
     points, moving = np.zeros((N, 3)), np.zeros(N, bool)
     for f in np.unique(reference):
@@ -88,7 +127,7 @@ def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, v
         distance, geom = model.cast(float(shot.q[f]), camera[:3, 3], rays)
         met = geom >= 0
         on = met & model.moving_geoms[geom]
-        world = camera[:3, 3] + rays * np.where(met, distance, 1e3)[:, None]
+        world = camera[:3, 3] + rays * np.where(met, distance, _to_wall(model, shot, camera[:3, 3], rays))[:, None]
         back = model.link_pose(float(shot.q[0]), float(shot.q[f]))
         world[on] = world[on] @ back[:3, :3].T + back[:3, 3]
         points[rows], moving[rows] = world, on
@@ -100,7 +139,7 @@ def _known(model: Model, motion: str, small: bool, shot: Shot, uv: np.ndarray, v
     scene = Scene(model, motion, False, small, shot, points, moving, reference, true, depth, visible,
                   float(np.linalg.norm(np.ptp(both, axis=0))), np.zeros(N))  # fmt: skip
     wrong = visible & (np.linalg.norm(np.nan_to_num(uv - true), axis=-1) > STRAY_PX)
-    return Given(scene, 4, np.where(visible[..., None], uv, np.nan), visible, None, None, wrong, 0.0, 0.0, 0.0)
+    return Given(scene, 4, given_uv, visible, None, None, wrong, 0.0, 0.0, 0.0, warp=warp)
 
 
 def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -> np.ndarray:
@@ -115,9 +154,7 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
     from reconstruct.synth.render import render
     from reconstruct.synth.staging import Clip
 
-    q0 = float(shot.q[0])
-    corners = np.concatenate([model.corners(q0, True), model.corners(q0, False)])
-    scale = DIAGONAL / float(np.linalg.norm(np.ptp(corners, axis=0)))
+    q0, corners, scale = float(shot.q[0]), _corners(model, shot), _scale(model, shot)
     camera = shot.T_world_camera[0]
     # The lamps stand at low y: the whole scene is turned so that the camera does too.
     heading = np.arctan2(camera[1, 2], camera[0, 2])
@@ -128,16 +165,16 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
     model.pose(q0)
     for g in range(model.mj.ngeom):
         if int(model.mj.geom_type[g]) != int(mujoco.mjtGeom.mjGEOM_BOX):
-            raise ValueError(f"{model.name}: row 4 renders boxes only")
+            raise ValueError(f"{model.name}: rows 4 and 5 render boxes only")
         on = bool(model.moving_geoms[g])
         boxes.append(Box("moving" if on else "static", there(model._data.geom_xpos[g]),
                          2 * scale * model.mj.geom_size[g], _paint(texture, colours[on]),
                          turn @ model._data.geom_xmat[g].reshape(3, 3)))  # fmt: skip
     view = turn @ camera[:3, :3]  # camera to world
     eye, middle = there(camera[:3, 3]), there(corners.mean(0))
-    wall = middle + 1.1 * DIAGONAL * view[:, 2]
+    wall = middle + WALL * DIAGONAL * view[:, 2]
     paper = tx.with_stickers(tx.plaster((0.80, 0.77, 0.70)), 30, 0.18)
-    boxes.append(Box("room", wall + 0.05 * view[:, 2], np.array([4.0, 3.0, 0.04]), paper, view, 300.0))
+    boxes.append(Box("room", wall + (WALL_FRONT + 0.02) * view[:, 2], np.array([4.0, 3.0, 0.04]), paper, view, 300.0))
     # A hand on the link's part that moves most, between the camera and the object: from below, or from where else the
     # arm goes through nothing.
     pose = HandPose()
@@ -150,12 +187,13 @@ def pictures(model: Model, shot: Shot, texture: str, rng: np.random.Generator) -
     held = [_hold(pose, touched, view @ Rotation.from_euler("z", a, degrees=True).as_matrix()) for a in APPROACHES]
     clear = [_clearance(pose, T, link, boxes) for T in held]
     hand = held[next((k for k, c in enumerate(clear) if c >= -FLESH), int(np.argmax(clear)))]
-    look = np.eye(4)
-    look[:3, :3], look[:3, 3] = view.T, -view.T @ eye
+    T = len(shot.q)
+    look = np.tile(np.eye(4), (T, 1, 1))
+    look[:, :3, :3] = np.swapaxes(turn @ shot.T_world_camera[:, :3, :3], 1, 2)
+    look[:, :3, 3] = -np.einsum("tij,tj->ti", look[:, :3, :3], there(shot.T_world_camera[:, :3, 3]))
     shown = Shown(tuple(boxes), None, None, None, 0.0, (0.0, 0.0))
     clip = Clip("row 4", "", shown, pose, "right", hand[0], np.zeros(3), np.zeros(3), eye, middle, FOCAL / SIZE[0])
-    T = len(shot.q)
-    motion = Motion(np.arange(T) / 24, shot.q, np.ones(T, bool), link, hand, np.tile(look, (T, 1, 1)))
+    motion = Motion(np.arange(T) / RATE, shot.q, np.ones(T, bool), link, hand, look)
     return render(clip, motion, SIZE, int(rng.integers(1 << 30))).image
 
 

@@ -13,7 +13,7 @@ PAPER = (
     ("Articulat3D there (quoted), orbiting camera", "0.91", "1.53", "2.58"),
 )
 NAMES = {1: "1: perfect depth, tracks, masks", 2: "2: noisy depth, tracks, masks", 3: "3: noisy tracks, no depth",
-         4: "4: pixels"}  # fmt: skip
+         4: "4: pixels", 5: "5: pixels, camera in a hand"}  # fmt: skip
 
 
 def _mean(rows: Iterable[dict], key: str) -> float:
@@ -64,8 +64,8 @@ def groups(rows: list[dict]) -> dict[str, list[dict]]:
             for orbit in (False, True):
                 some = [r for r in rows if (r["row"], r["orbit"], r["small"]) == (number, orbit, small)]
                 for texture in sorted({r.get("texture", "") for r in some}):
-                    camera = "orbiting camera" if orbit else "static camera"
-                    name = [NAMES[number], camera, *["small motion"] * small, *filter(None, [texture])]
+                    camera = "" if number == 5 else "orbiting camera" if orbit else "static camera"
+                    name = filter(None, [NAMES[number], camera, "small motion" * small, texture])
                     out[", ".join(name)] = [r for r in some if r.get("texture", "") == texture]
     return out
 
