@@ -11,6 +11,7 @@ from scipy.special import expit
 
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.cameras import before_the_link, smoother_before_the_link
+from reconstruct.joint.groups import triangulated
 from reconstruct.joint.halves import halves, widened
 from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, majority, probabilities, tempered, votes
 from reconstruct.joint.paths import Paths, held
@@ -146,6 +147,23 @@ class Still:
     known: bool = False
     sigma: float | None = None
 
+    def before(self, view: View, paths: Paths, log_focal: float) -> Still:
+        """The scene with the points that a path gives it: one that was fitted has a scale of its own.
+
+        Args:
+            paths: of all tracks.  log_focal: correction of the focal length's logarithm that goes with the path.
+        """
+        assert view.R is not None and view.t is not None
+        uv = paths.uv[self.ids]
+        x, seen = uv / (view.focal * np.exp(log_focal)), np.isfinite(uv[..., 0])
+        X = triangulated(x, seen, view.R, view.t, triangulated(x, seen, view.R, view.t))
+        # What the path hardly passes goes to the others' depth.
+        good = X[:, 2] > 0
+        first = seen.argmax(1)
+        there = np.concatenate([x[np.arange(len(x)), first], np.ones((len(x), 1))], axis=1) * np.median(X[good, 2])
+        there = np.einsum("nji,nj->ni", view.R[first], there - view.t[first])
+        return replace(self, X=np.where(good[:, None], X, there))
+
 
 def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
     """A key-frame state as a start for all frames, with the link's median depth as the unit.
@@ -193,6 +211,11 @@ class View:
         R, t = (None, None) if self.R is None else (self.R[frames], self.t[frames])
         return Sightings(np.where(seen[..., None], some.uv, 0.0), seen, np.ones(len(some)), self.focal, self.focal_std,
                          R, t, frames, lasting, slip=some.slip)  # fmt: skip
+
+    def before(self, s: Sightings) -> Sightings:
+        """The same sightings before this path."""
+        assert s.frames is not None
+        return s if self.R is None else replace(s, R=self.R[s.frames], t=self.t[s.frames])
 
     def corrected(self, b: Bundle, some: np.ndarray) -> View:
         """The camera's path as a bundle adjustment of some frames found it, interpolated between them."""
@@ -256,7 +279,9 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best = {kind: polish(b, sight) for kind, b in best.items()}
         best, sight = held_only(best, sight) if view.R is None and sight.slip is None else (best, sight)
     else:
-        best, sight = in_sight_only(*_together(_across_kinds(best, sight), sight, paths, still, view))
+        best = _across_kinds(best, sight)
+        scenes, views = dict.fromkeys(best, still), dict.fromkeys(best, view)
+        best, sight = in_sight_only(*_together(best, sight, paths, scenes, views))
     sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
     probability = _ruled_out(type_probabilities(best, sight), refuted)
@@ -265,7 +290,8 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
 
     # Now that the motion is known, on all frames whatever follows it joins in, and the types are weighed on all of it.
     kind = _winner(probability)
-    best, members, still, view = _on_all_frames(best, kind, sight, paths, members, still, view)
+    best, members, still, views = _on_all_frames(best, kind, sight, paths, members, still, view)
+    view = views[kind]
     some = _spread_out(T, MOST_FRAMES if still is None else FREE_FRAMES)
     best = {k: replace(b, q=b.q[some] - b.q[some[0]]) for k, b in best.items()}
     lead = best[kind]
@@ -276,7 +302,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     sight = _held_frames_only(view.sightings(paths[members], some, lasting=100.0))
     bound = _spread_out(len(members), MOST_TRACKS)
     few, lost = sight.of(bound), np.zeros(0, int)
-    best = {k: place_points(replace(b, X=X[bound]), few) for k, b in best.items()}
+    best = {k: place_points(replace(b, X=X[bound]), views[k].before(few)) for k, b in best.items()}
     if still is None:
         best = {k: polish(b, few, iterations=30) for k, b in best.items()}
         shown = few.seen.any(0)
@@ -285,7 +311,8 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     else:
         apart = ~np.isin(still.ids, members)
         rest = replace(still, ids=still.ids[apart], X=still.X[apart])
-        best, few = in_sight_only(*_together(best, few, paths, rest, view))
+        rests = {k: rest.before(views[k], paths, b.log_focal) for k, b in best.items()}
+        best, few = in_sight_only(*_together(best, few, paths, rests, views))
     few = _errors(best, few, view.restless)
     best = {k: polish(b, few) for k, b in best.items()}
     once, last, sure, probability, rival = _decided(best, others if still is None else None, few, refuted)
@@ -328,7 +355,7 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
         without strays lead to, its uncertainty, the types' probabilities, and the most probable other axis.
     """
     if others is None:
-        probability = _ruled_out(type_probabilities(best, s), refuted)
+        probability = _ruled_out(type_probabilities(best, s, _near([best["revolute"]], s)), refuted)
         last = best[_winner(probability)]
         return last, last, spread(last, s), probability, None
 
@@ -338,8 +365,7 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
     best, near = dict(best), []
     hinges = [best["revolute"], *again("revolute")]
     if _winner(_ruled_out(type_probabilities(best, s), refuted)) == "prismatic":
-        every = [*hinges, polish(best["revolute"], s, hold=HELD)]
-        near = [b for b in every if radius_cost(b, s) < NEAR * b.sigma**2 * s.lasting and turn_deg(b) < 360]
+        near = _near([*hinges, polish(best["revolute"], s, hold=HELD)], s)
     else:
         # Until the errors are known the priors weigh much, and strays prefer what they will: on all frames another
         # start may be the better one.
@@ -354,6 +380,11 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
     # Halves scatter with the strays in them: what misleads is not always told from the link.
     sure = widened(spread(last, clean), better, several)
     return once, last, sure, probability, _rival(last, every, clean)
+
+
+def _near(hinges: Sequence[Bundle], s: Sightings) -> list[Bundle]:
+    """Those that are as near as hinges are."""
+    return [b for b in hinges if radius_cost(b, s) < NEAR * b.sigma**2 * s.lasting and turn_deg(b) < 360]
 
 
 def _errors(best: dict[str, Bundle], sight: Sightings, restless: float) -> Sightings:
@@ -410,10 +441,16 @@ def _spread_out(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _together(best: dict[str, Bundle], sight: Sightings, paths: Paths, still: Still, view: View):
-    """Joint and camera in one bundle adjustment: the bundles with the scene's points and poses, and its sightings."""
+def _together(best: dict[str, Bundle], sight: Sightings, paths: Paths, stills: Mapping[str, Still],
+              views: Mapping[str, View]):  # fmt: skip
+    """Joint and camera in one bundle adjustment: the bundles with the scene's points and poses, and its sightings.
+
+    Args:
+        stills, views: of every type, points of the same scene and the path before it.
+    """
+    still = next(iter(stills.values()))
     pick = _spread_out(len(still.ids), MOST_STILL)
-    scene = view.sightings(paths[still.ids[pick]], sight.frames)
+    scene = next(iter(views.values())).sightings(paths[still.ids[pick]], sight.frames)
     relative = np.ones(len(sight.uv) + len(pick))
     if still.sigma is not None:
         moving = max(min(b.sigma for b in best.values()), 0.05)
@@ -428,33 +465,39 @@ def _together(best: dict[str, Bundle], sight: Sightings, paths: Paths, still: St
         relative=relative,
         free=True,
     )
-    start = {k: replace(b, X=np.concatenate([b.X, still.X[pick]]), R=scene.R, t=scene.t) for k, b in best.items()}
+    start = {}
+    for k, b in best.items():
+        own = views[k].before(scene)
+        start[k] = replace(b, X=np.concatenate([b.X, stills[k].X[pick]]), R=own.R, t=own.t)
     return {k: polish(b, both) for k, b in start.items()}, both
 
 
 def _on_all_frames(best: dict[str, Bundle], kind: str, sight: Sightings, paths: Paths, members: np.ndarray,
                    still: Still | None, view: View):  # fmt: skip
-    """From the first round's frames to all, before the camera found so far: the link alone, its tracks, scene and view.
+    """From the first round's frames to all, before the camera found so far: the link alone, its tracks, the scene,
+    and of every type the view.
 
     Before a moving camera link and scene change places where the path before the link is clearly the smoother one. That
     is the same joint run backwards.
     """
-    every = view if still is None else view.corrected(best[kind], sight.frames)
+    views = {k: view if still is None else view.corrected(b, sight.frames) for k, b in best.items()}
+    every = views[kind]
     link = np.ones(len(sight.uv), bool) if sight.link is None else sight.link
     seen = every.sightings(paths[members], np.arange(paths.uv.shape[1]))
     out = {
-        k: states_of_all_frames(replace(b, X=b.X[link], R=None, t=None), seen, sight.frames) for k, b in best.items()
+        k: states_of_all_frames(replace(b, X=b.X[link], R=None, t=None), views[k].before(seen), sight.frames)
+        for k, b in best.items()
     }
     if still is None or still.known or every.R is None or every.t is None:
-        return out, members, still, every
+        return out, members, still, views
     b = best[kind]
     if b.R is None or b.t is None or not smoother_before_the_link(b, sight):
-        return out, members, still, every
+        return out, members, still, views
     path = before_the_link(out[kind].twist, out[kind].q, every.R, every.t)
     others = still.ids[_spread_out(len(still.ids), MOST_STILL)]
     scene = Still(members, out[kind].X)
     out = {k: replace(b, q=-b.q, X=best[k].X[~link]) for k, b in out.items()}
-    return out, others, scene, replace(every, R=path[0], t=path[1])
+    return out, others, scene, dict.fromkeys(out, replace(every, R=path[0], t=path[1]))
 
 
 def _winner(probability: dict[str, float]) -> str:
@@ -543,7 +586,8 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
             which wins has to win the votes against these.
     """
     hinge, slide = best["revolute"], best["prismatic"]
-    size = float(np.linalg.norm(np.quantile(hinge.X, 0.95, axis=0) - np.quantile(hinge.X, 0.05, axis=0)))
+    X = hinge.X if sight.link is None else hinge.X[sight.link]
+    size = float(np.linalg.norm(np.quantile(X, 0.95, axis=0) - np.quantile(X, 0.05, axis=0)))
     curvature = spread(hinge, sight).curvature
     if "screw" in best:
         # A body that is carried freely refutes both types together: no vote between them is asked for, but that every

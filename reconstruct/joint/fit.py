@@ -23,7 +23,7 @@ from reconstruct.joint.finish import (
     finish,
 )
 from reconstruct.joint.groups import Rigid, two_bodies
-from reconstruct.joint.handheld import filmed, path_from_rest, scaled_to_link
+from reconstruct.joint.handheld import Path, at_rest, filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.parallels import along_edges
@@ -79,6 +79,9 @@ FREE_SHARE = 1 / 4
 and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0 to 0.15; what is lifted away leaves
 0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
 
+ROUNDS = 3
+"""Of a hand-held camera's path and the tracks that it explains: points off the plane of the compensation leave their
+place in the picture until they are known to rest."""
 TRIES = 3
 """Draws of the search before a joint is refused, the second with two regions of the picture besides, the third with
 three: where most of what moves is a shadow or an arm, a draw may find nothing better than that."""
@@ -138,6 +141,8 @@ def fit_joint(
         # Tracks on nothing but the part look like a moving camera too: then there are no two rigid groups.
         if camera_moving or fit is not None:
             return fit or JointFit("refused", NO_SCENE, tracks=len(paths))
+    if video.warp is not None:
+        camera = _with_path(camera, paths, video.warp)
     answer, before, most, sigma = None, None, 0.0, np.nan
     for k in range(TRIES):
         draw = _one_draw(video, paths, camera, view, known, rng, pictures, lambda x, k=k: tell((k + x) / TRIES), k + 1)
@@ -184,7 +189,7 @@ def _dominant(tries: Sequence[_Consensus]) -> _Consensus:
 def _of_a_part(video: Video, paths: Paths, camera: _Camera, view: View, known: float | None, rng: np.random.Generator,
                pictures: Pictures | None) -> JointFit | None:  # fmt: skip
     """The hinge that a part of the motion follows, of which the rest knows nothing, or None; arguments of _one_draw."""
-    moving = _moving(paths, camera.diagonal)
+    moving = _moving(paths, camera)
     path = np.cumsum(image_speed(paths.uv[moving]))
     cuts = np.concatenate([[0], np.searchsorted(path, path[-1] * np.arange(1, 10) / 10) + 1, [len(video)]])
     for part in PARTS:
@@ -271,7 +276,7 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
 
     if found.refusal and found.scattered:
         # Several parts may have moved one after the other: look at one stretch of motion at a time.
-        stretches = motion_stretches(paths.uv[_moving(paths, camera.diagonal)], video.time)
+        stretches = motion_stretches(paths.uv[_moving(paths, camera)], video.time)
         tries = [
             _consensus(_only(paths, span), camera, rng, lambda _: None) for span in stretches[:3] if len(stretches) > 1
         ]
@@ -335,9 +340,7 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
     """
     # The picture's warp hardly turns edges.
     still, as_filmed = paths - camera.centre, replace(paths, uv=filmed(paths.uv, warp)) - camera.centre
-    rest = np.setdiff1d(np.arange(len(paths)), np.concatenate([_moving(paths, camera.diagonal), found.members]))
-    path = path_from_rest(as_filmed.uv, still.uv, rest, camera.focal)
-    if path is None:
+    if (path := camera.path) is None:
         restless = _restlessness(paths, camera, DEPTHS)
         view = replace(view, restless=restless if np.isfinite(restless) else 0.0)
         return finish(found.starts, still, found.members, view), restless, "; the camera moves: taken to its first view"
@@ -345,6 +348,18 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
     view, scene = scaled_to_link(path, leading, as_filmed, found.members, view)
     done = finish(found.starts, as_filmed, found.members, view, scene)
     return done, path.sigma, "; the camera moves: its path is fitted together with the joint"
+
+
+def _with_path(camera: _Camera, paths: Paths, warp: np.ndarray) -> _Camera:
+    """The camera with its path and the scene that this explains, where enough rests in the compensated picture."""
+    still, as_filmed = paths - camera.centre, replace(paths, uv=filmed(paths.uv, warp)) - camera.centre
+    for _ in range(ROUNDS):
+        rest = np.setdiff1d(np.arange(len(paths)), _moving(paths, camera))
+        path = path_from_rest(as_filmed.uv, still.uv, rest, camera.focal)
+        if path is None:
+            break
+        camera = replace(camera, path=path, scene=at_rest(path, as_filmed.uv, still.uv, camera.focal))
+    return camera
 
 
 @dataclass(frozen=True)
@@ -360,11 +375,14 @@ class _Draw:
 
 @dataclass(frozen=True)
 class _Camera:
-    """focal: working px.  centre: (2,) working px.  diagonal: of the working frame, px."""
+    """focal: working px.  centre: (2,) working px.  diagonal: of the working frame, px.  path: of a camera in a hand,
+    where enough of the scene rests.  scene: (k,) indices of the tracks that it explains as points at rest."""
 
     focal: float
     centre: np.ndarray
     diagonal: float
+    path: Path | None = None
+    scene: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
 @dataclass(frozen=True)
@@ -391,31 +409,30 @@ class _Consensus:
 
 def _paths(video: Video, tracks: Tracks) -> Paths:
     """The tracks in working px."""
-    # What the compensation of a hand-held camera leaves is along edges as much as across.
-    slip = None if video.warp is not None else tracks.slip
-    return Paths(video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan)), slip)
+    return Paths(video.to_work(np.where(tracks.visible[..., None], tracks.uv, np.nan)), tracks.slip)
 
 
-def _moving(paths: Paths, diagonal: float) -> np.ndarray:
-    """(k,) indices of the tracks that leave their place; working px."""
+def _moving(paths: Paths, camera: _Camera) -> np.ndarray:
+    """(k,) indices of the tracks that leave their place, but for those that the camera's path explains; working px."""
     extent = np.zeros(len(paths))
     some = paths.seen.sum(1) > 1
     if some.any():
         # Sliding along an edge included: taken out, half of a moving part's tracks would not count as moving.
         uv = paths.uv[some]
         extent[some] = np.linalg.norm(np.nanmax(uv, axis=1) - np.nanmin(uv, axis=1), axis=-1)
-    return np.flatnonzero(extent > MOVING_SHARE * diagonal)
+    moving = np.flatnonzero(extent > MOVING_SHARE * camera.diagonal)
+    return np.setdiff1d(moving, camera.scene)
 
 
 def moving_tracks(video: Video, tracks: Tracks) -> np.ndarray:
     """(k,) indices of the tracks whose extent exceeds :data:`MOVING_SHARE` of the image diagonal."""
     h, w = video.frames.shape[1:3]
-    return _moving(_paths(video, tracks), float(np.hypot(h, w)))
+    return _moving(_paths(video, tracks), _Camera(1.0, np.zeros(2), float(np.hypot(h, w))))
 
 
 def _restlessness(paths: Paths, camera: _Camera, share: float) -> float:
     """Working px, RMS, by which a share of the tracks at rest leave their place at most; infinite if there are none."""
-    rest = np.setdiff1d(np.flatnonzero(paths.seen.mean(1) > 0.5), _moving(paths, camera.diagonal))
+    rest = np.setdiff1d(np.flatnonzero(paths.seen.mean(1) > 0.5), _moving(paths, camera))
     if not len(rest):
         return np.inf
     some = paths[rest]
@@ -425,7 +442,7 @@ def _restlessness(paths: Paths, camera: _Camera, share: float) -> float:
 
 def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Callable[[float], None],
                regions: int = 1) -> _Consensus:  # fmt: skip
-    moving = _moving(paths, camera.diagonal)
+    moving = _moving(paths, camera)
     if len(moving) < MIN_INLIERS:
         return _Consensus(refusal=f"nothing moves: {len(moving)} of {len(paths)} tracks leave their place")
     keys = key_frames(paths.uv[moving])

@@ -33,6 +33,10 @@ RATIOS = np.exp(np.linspace(np.log(0.4), np.log(3.0), 9))
 """Depth of the scene over the link's, from which the adjustment of both starts."""
 FEW_FRAMES, COARSE_PX = 40, 3.0
 """Frames in which ratios are compared, and the scale of the loss there."""
+NEARER, EXPLAINED = 0.5, 0.1
+"""Depth over that of the nearest of the scene from which on a track is taken for a point at rest, and the share of what
+it leaves its place by in the compensated picture that it may miss that point by. A part that goes straight for a few
+frames goes as some point does that is near enough to the camera."""
 MIN_SEEN = 8
 """Points of the scene that every frame has to see."""
 
@@ -100,6 +104,23 @@ def path_from_rest(uv: np.ndarray, still: np.ndarray, rest: np.ndarray, focal: f
     R, t = R @ R[0].T, t - np.einsum("tij,jk,k->ti", R, R[0].T, t[0])
     unit = float(np.median(X[good, 2]))
     return Path(R, t / unit, ids[good], X[good] / unit, sigma)
+
+
+def at_rest(path: Path, uv: np.ndarray, still: np.ndarray, focal: float) -> np.ndarray:
+    """(k,) indices of the tracks that the path explains as points at rest.
+
+    Args:
+        uv: (N, T, 2) px from the principal point as filmed, NaN where not seen.
+        still: the same in the compensated picture.  focal: px.
+    """
+    x, seen = uv / focal, np.isfinite(uv[..., 0])
+    X = triangulated(x, seen, path.R, path.t, triangulated(x, seen, path.R, path.t))
+    off = _off(x, seen, path.R, path.t, X, focal)
+    some = seen.any(1)
+    left = np.zeros(len(uv))
+    left[some] = np.nanmedian(np.linalg.norm(still[some] - np.nanmedian(still[some], axis=1)[:, None], axis=-1), axis=1)
+    near = NEARER * np.quantile(path.X[:, 2], 0.05)
+    return np.flatnonzero((off < np.maximum(STRAY * max(path.sigma, 0.05), EXPLAINED * left)) & (X[:, 2] > near))
 
 
 def _off(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray, focal: float) -> np.ndarray:

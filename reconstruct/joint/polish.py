@@ -233,9 +233,10 @@ class _Priors:
         bend = s.bend * (sigma / (BEND * max(float(np.ptp(b.q[held])), 1e-9))) ** 2
         ends = int(held[np.argmin(b.q[held])]), int(held[np.argmax(b.q[held])])
         path = float(b.q[ends[1]] - b.q[ends[0]])
-        size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
+        X = b.X if s.link is None else b.X[s.link]
+        size = float(np.linalg.norm(np.quantile(X, 0.95, axis=0) - np.quantile(X, 0.05, axis=0)))
         reach, flat, nearby = Reach.of(b, s, sigma), Flat.of(b, s, sigma), Nearby.of(b, s, sigma)
-        if b.kind == "prismatic" or s.link is not None or path <= 0 or size <= 0:
+        if b.kind == "prismatic" or path <= 0 or size <= 0:
             return cls(focal, bend, 0.0, 0.0, ends, reach, flat, nearby, s.along, parallel)
         radius = hold * sigma**2 * s.lasting / HINGE_SPREAD**2
         log_turn = float(np.log(path / (HINGE_RADIUS * size)))

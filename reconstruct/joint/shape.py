@@ -30,25 +30,27 @@ class Reach:
     contradicts it in points far before or behind the link.
 
     Attributes:
-        middle: (3,).  radius: of the sphere.  weight: px^2 over a squared length; 0 beside a resting scene.
+        middle: (3,).  radius: of the sphere.  weight: (N,) px^2 over a squared length, 0 of a resting scene's points.
     """
 
     middle: np.ndarray
     radius: float
-    weight: float
+    weight: np.ndarray
 
     @classmethod
     def of(cls, b: Bundle, s: Sightings, sigma: float) -> Reach:
         """The link's size is read across the line of sight, and is one standard deviation beyond the sphere."""
-        middle = np.median(b.X, axis=0)
-        across = b.X[:, :2] / np.maximum(b.X[:, 2:], 1e-3) * middle[2]
+        link = np.ones(len(b.X), bool) if s.link is None else s.link
+        X = b.X[link]
+        middle = np.median(X, axis=0)
+        across = X[:, :2] / np.maximum(X[:, 2:], 1e-3) * middle[2]
         size = float(np.linalg.norm(np.quantile(across, 0.95, axis=0) - np.quantile(across, 0.05, axis=0)))
-        weight = 0.0 if s.link is not None or size <= 0 else s.lasting * (sigma / size) ** 2
-        return cls(middle, REACH * size, weight)
+        weight = 0.0 if size <= 0 else s.lasting * (sigma / size) ** 2
+        return cls(middle, REACH * size, np.where(link, weight, 0.0))
 
     def cost(self, X: np.ndarray) -> float:
         """Of points (N, 3), px^2."""
-        return self.weight * float(np.sum(np.maximum(np.linalg.norm(X - self.middle, axis=1) - self.radius, 0) ** 2))
+        return float(self.weight @ np.maximum(np.linalg.norm(X - self.middle, axis=1) - self.radius, 0) ** 2)
 
     def slopes(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N, 3, 3) and (N, 3) of half the cost by the points."""
@@ -56,8 +58,8 @@ class Reach:
         far = np.linalg.norm(d, axis=1)
         out = d / np.maximum(far, 1e-12)[:, None]
         beyond = np.maximum(far - self.radius, 0)
-        H = self.weight * (beyond > 0)[:, None, None] * out[:, :, None] * out[:, None]
-        return H, self.weight * beyond[:, None] * out
+        H = (self.weight * (beyond > 0))[:, None, None] * out[:, :, None] * out[:, None]
+        return H, (self.weight * beyond)[:, None] * out
 
 
 @dataclass(frozen=True)
