@@ -169,6 +169,7 @@ def _ratios_at_seeds(fit: JointFit, given: Given) -> np.ndarray:
     A point on an edge may slide along it afterwards, and half of those on a rim are seeded beside it.
     """
     shot, model = given.scene.shot, given.scene.model
+    first = shot.T_world_camera[0]
     ids = np.asarray(fit.point_track, int)
     frame, uv = given.scene.seed[ids], given.filmed
     T_fit, T_camera = fit.link_pose(_all_frames(fit, len(shot.q))[frame]), np.asarray(fit.T_camera_world, float)
@@ -181,7 +182,8 @@ def _ratios_at_seeds(fit: JointFit, given: Given) -> np.ndarray:
         rays = pixel_rays(uv[ids[rows], f][:, None] + beside, shot.K, camera)
         distance, geom = model.cast(float(shot.q[f]), camera[:3, 3], rays.reshape(-1, 3))
         on = ((geom >= 0) & model.moving_geoms[geom]).reshape(len(rows), -1)
-        depth = (distance.reshape(on.shape) * (rays @ camera[:3, 2]))[np.arange(len(rows)), on.argmax(1)]
+        X = camera[:3, 3] + rays * np.where(on, distance.reshape(on.shape), 0.0)[..., None]
+        depth = ((X - first[:3, 3]) @ first[:3, 2])[np.arange(len(rows)), on.argmax(1)]
         z_true[rows] = np.where(on.any(1), depth, np.nan)
     ratio = z_true / z_fit
     return ratio[np.isfinite(ratio) & (ratio > 0)]

@@ -70,6 +70,9 @@ UNDECIDED = 1.0
 NEAR, HELD = 4.0, 30.0
 """A hinge is as near as hinges are if the logarithm of its radius is within two standard deviations of the prior; and
 how much more than it is worth the prior counts to get there."""
+SPANS, NOISY_PX = 4, 0.2
+"""Spans of a camera's path that are independent of each other, and px, of a point at the link's depth, up to which a
+step is none."""
 APART_DEG = 8.0
 """Axes so far from each other are two optima, not one."""
 NO_SCREW = 1e-3
@@ -302,7 +305,12 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
     sight = _held_frames_only(view.sightings(paths[members], some, lasting=100.0))
     bound = _spread_out(len(members), MOST_TRACKS)
     few, lost = sight.of(bound), np.zeros(0, int)
-    best = {k: place_points(replace(b, X=X[bound]), views[k].before(few)) for k, b in best.items()}
+    points = dict.fromkeys(best, X)
+    if still is not None:
+        # Before a path of its own a type has points of its own.
+        far = {k: np.tile(np.median(b.X, axis=0), (len(more), 1)) for k, b in best.items() if k != kind}
+        points |= {k: np.concatenate([best[k].X, far[k]]) for k in far}
+    best = {k: place_points(replace(b, X=points[k][bound]), views[k].before(few)) for k, b in best.items()}
     if still is None:
         best = {k: polish(b, few, iterations=30) for k, b in best.items()}
         shown = few.seen.any(0)
@@ -593,16 +601,19 @@ def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence
         # A body that is carried freely refutes both types together: no vote between them is asked for, but that every
         # neighbourhood is carried so, not strays alone.
         screw = best["screw"]
-        odds = log_odds_hinge(hinge.twist, curvature, size, _cost_gain(hinge, slide, sight))
-        more = log_odds_screw(screw.twist, spread(screw, sight).curvature, _cost_gain(screw, hinge, sight))
+        gain = _cost_gain(hinge, slide, sight) + calmer(hinge, slide, sight)
+        odds = log_odds_hinge(hinge.twist, curvature, size, gain)
+        gain = _cost_gain(screw, hinge, sight) + calmer(screw, hinge, sight)
+        more = log_odds_screw(screw.twist, spread(screw, sight).curvature, gain)
         if more > 0:
             more = tempered(more, _votes(screw, hinge, sight))
         p = probabilities({"prismatic": 0.0, "revolute": odds, "screw": odds + more})
         if turn_deg(screw) >= SCREW_TURN_DEG or p["screw"] >= FREE_BODY:
             return p
+    path = calmer(hinge, slide, sight)
     odds, by_costs, alone = (
         log_odds_hinge(hinge.twist, curvature, size, gain)
-        for gain in (_gain(hinge, slide, sight), _cost_gain(hinge, slide, sight), 0.0)
+        for gain in (_gain(hinge, slide, sight) + path, _cost_gain(hinge, slide, sight) + path, 0.0)
     )
     costs, near_each_other = _costs(hinge, slide, sight), clusters(hinge, sight.link, VOTERS)
     z, most = votes(*costs, near_each_other), majority(*costs, near_each_other)
@@ -633,6 +644,27 @@ def _shapely(b: Bundle, sight: Sightings) -> bool:
 def _cost_gain(one: Bundle, other: Bundle, sight: Sightings) -> float:
     """Log-likelihood ratio at the costs of the adjustment, where the noise's size is unknown."""
     return one.cost / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
+
+
+def calmer(one: Bundle, other: Bundle, sight: Sightings) -> float:
+    """Log-likelihood ratio of the paths that two joints need of a camera whose path is fitted with them; 0 of one that
+    is not.
+
+    A joint of the wrong type has the camera go along with what it cannot explain. Of SPANS steps of the camera's
+    centre, each of three normal numbers of one unknown size, the likelihood with the size integrated over its logarithm
+    goes with the power of their sum of squares. What noise does to a path that is held to its px is no step.
+    """
+    if not sight.free:
+        return 0.0
+    sums = []
+    for b in (one, other):
+        assert b.R is not None and b.t is not None and sight.link is not None
+        unit = float(np.median(b.X[sight.link, 2]))
+        centre = -np.einsum("tji,tj->ti", b.R, b.t) / unit
+        cuts = np.linspace(0, len(centre) - 1, SPANS + 1).round().astype(int)
+        sums.append(float(np.sum(np.diff(centre[cuts], axis=0) ** 2)))
+    floor = 3 * SPANS * (NOISY_PX / sight.focal) ** 2
+    return 1.5 * SPANS * float(np.log((sums[1] + floor) / (sums[0] + floor)))
 
 
 def _costs(one: Bundle, other: Bundle, sight: Sightings) -> tuple[np.ndarray, np.ndarray]:

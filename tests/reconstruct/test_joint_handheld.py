@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import ProviderInfo, Tracks
-from reconstruct.joint.finish import Still, View
+from reconstruct.joint.finish import Still, View, calmer
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.handheld import at_rest, filmed, path_from_rest
 from reconstruct.joint.models import joint_transform
@@ -195,3 +195,23 @@ def test_a_resting_scene_may_be_as_far_away_as_it_likes_but_the_links_points_sta
     assert g[3, 2] > 0 and not g[[0, 1, 2, 4, 5]].any() and not H[4:].any()
     alone = Reach.of(replace(b, X=X[:4]), replace(s.of(np.arange(4)), link=None), 0.3)
     assert reach.cost(X) == pytest.approx(alone.cost(X[:4]))
+
+
+def test_a_joint_that_needs_the_camera_to_go_along_is_the_less_probable():
+    """A camera at rest, and one that goes 3 % of the link's depth with the swing, which the picture holds as well."""
+    T, link = 41, np.arange(8) < 4
+    X = np.column_stack([np.linspace(-0.1, 0.1, 8), np.zeros(8), np.where(link, 1.0, 3.0)])
+    s = Sightings(np.zeros((8, T, 2)), np.ones((8, T), bool), np.ones(8), FOCAL, link=link, free=True)
+    R, along = np.tile(np.eye(3), (T, 1, 1)), np.linspace(0, 1, T)[:, None] * np.array([0.03, 0, 0])
+    t = np.random.default_rng(0).normal(0, 1e-5, (T, 3))
+    still = Bundle("revolute", Twist(np.zeros(3), AXIS, np.zeros(3)), np.zeros(T), X, R=R, t=t)
+    goes = replace(still, kind="prismatic", t=still.t - along)
+    assert calmer(still, goes, s) > 10 and calmer(still, goes, s) == -calmer(goes, still, s)
+    # In another unit of length it is the same path.
+    twice = replace(goes, X=2 * X, t=2 * goes.t)
+    assert calmer(still, twice, s) == pytest.approx(calmer(still, goes, s))
+    # What a hand does anyhow says nothing, nor does a path that is not fitted.
+    sway = 0.02 * np.sin(np.linspace(0, 9, T))[:, None] * np.array([1.0, 0.5, 0])
+    swaying = [replace(b, t=b.t - sway) for b in (still, replace(still, t=0.9 * still.t))]
+    assert abs(calmer(*swaying, s)) < 0.5
+    assert calmer(still, goes, replace(s, free=False)) == 0.0
