@@ -98,7 +98,7 @@ def test_sightings_keep_the_slip_of_their_tracks():
 def test_a_point_may_lie_anywhere_in_reach_and_is_called_back_from_beyond():
     truth, s = scene("revolute")
     reach = Reach.of(truth, s, 0.5)
-    assert reach.weight > 0 and reach.cost(truth.X) == 0
+    assert (reach.weight > 0).all() and reach.cost(truth.X) == 0
     X = truth.X.copy()
     X[7] += [0.0, 0.0, 3 * reach.radius]
     H, g = reach.slopes(X)
