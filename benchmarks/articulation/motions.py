@@ -132,7 +132,10 @@ def in_a_hand(shot: Shot, unit: float, rng: np.random.Generator) -> Shot:
     """The motion before a camera that a hand holds: from its first pose on it goes to and fro, slowly and quickly.
 
     Args:
-        shot: before a camera at rest.  unit: of its lengths, in m.
+        shot: before a camera at rest.  unit: of its lengths, in m.  rng: of the sway.
+
+    Returns:
+        The same states, with T_world_camera (T, 4, 4) that starts from the first one's.
     """
     t = np.arange(len(shot.q)) / RATE
 

@@ -653,6 +653,12 @@ def calmer(one: Bundle, other: Bundle, sight: Sightings) -> float:
     A joint of the wrong type has the camera go along with what it cannot explain. Of SPANS steps of the camera's
     centre, each of three normal numbers of one unknown size, the likelihood with the size integrated over its logarithm
     goes with the power of their sum of squares. What noise does to a path that is held to its px is no step.
+
+    Args:
+        one, other: of the same tracks, with poses R (T, 3, 3), t (T, 3), lengths in any unit: the link's depth is 1.
+
+    Returns:
+        Of ``one`` over ``other``: positive where its camera goes less.
     """
     if not sight.free:
         return 0.0
