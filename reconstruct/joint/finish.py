@@ -159,7 +159,9 @@ class Still:
         assert view.R is not None and view.t is not None
         uv = paths.uv[self.ids]
         x, seen = uv / (view.focal * np.exp(log_focal)), np.isfinite(uv[..., 0])
-        X = triangulated(x, seen, view.R, view.t, triangulated(x, seen, view.R, view.t))
+        slip = None if paths.slip is None else paths.slip[self.ids]
+        rough = triangulated(x, seen, view.R, view.t, slip=slip)
+        X = triangulated(x, seen, view.R, view.t, rough, slip=slip)
         # What the path hardly passes goes to the others' depth.
         good = X[:, 2] > 0
         first = seen.argmax(1)
@@ -219,6 +221,15 @@ class View:
         """The same sightings before this path."""
         assert s.frames is not None
         return s if self.R is None else replace(s, R=self.R[s.frames], t=self.t[s.frames])
+
+    def at_first(self, paths: Paths, depth: float) -> Paths:
+        """Tracks, px from the principal point, as a camera that stays in the first one's place would see them if all
+        were at one depth before the camera that did."""
+        if self.R is None or self.t is None:
+            return paths
+        x = np.concatenate([paths.uv / self.focal, np.ones((*paths.uv.shape[:2], 1))], axis=-1) * depth
+        x = np.einsum("tji,ntj->nti", self.R, x - self.t)
+        return replace(paths, uv=self.focal * x[..., :2] / np.maximum(x[..., 2:], 1e-3))
 
     def corrected(self, b: Bundle, some: np.ndarray) -> View:
         """The camera's path as a bundle adjustment of some frames found it, interpolated between them."""
@@ -285,6 +296,7 @@ def finish(starts: Starts, paths: Paths, ids: np.ndarray, view: View, still: Sti
         best = _across_kinds(best, sight)
         scenes, views = dict.fromkeys(best, still), dict.fromkeys(best, view)
         best, sight = in_sight_only(*_together(best, sight, paths, scenes, views))
+        best = _hinge_of_screw(best, sight)
     sight = _errors(best, sight, view.restless)
     best = _across_kinds(best, sight) if still is None else {k: polish(b, sight) for k, b in best.items()}
     probability = _ruled_out(type_probabilities(best, sight), refuted)
@@ -585,6 +597,17 @@ def _across_kinds(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bundle
     }
 
 
+def _hinge_of_screw(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bundle]:
+    """The same with the screw's own hinge where that is the better one: before a camera that is fitted too the two may
+    have ended on different paths."""
+    screw, hinge = best.get("screw"), best["revolute"]
+    if screw is None or screw.cost >= hinge.cost:
+        return best
+    own = polish(replace(screw, kind="revolute", twist=screw.twist.moved(np.zeros(6), "revolute")), sight)
+    better = own.cost + radius_cost(own, sight) < hinge.cost + radius_cost(hinge, sight)
+    return {**best, "revolute": own} if better else best
+
+
 def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence[Bundle] = ()) -> dict[str, float]:
     """Posterior of the types, from the curvature of the hinge and the advance of the screw.
 
@@ -679,8 +702,9 @@ def _costs(one: Bundle, other: Bundle, sight: Sightings) -> tuple[np.ndarray, np
     out = []
     for b in (one, other):
         cost = track_costs(residuals(b, sight), sight, limit)
-        if sight.link is None:
-            cost = np.where(compact(b.X) & (b.X[:, 2] > 0), cost, limit**2 * sight.weight * sight.seen.sum(1))
+        link = np.ones(len(b.X), bool) if sight.link is None else sight.link
+        lost = np.flatnonzero(link)[~(compact(b.X[link]) & (b.X[link, 2] > 0))]
+        cost[lost] = limit**2 * sight.weight[lost] * sight.seen[lost].sum(1)
         out.append(cost)
     return out[0], out[1]
 

@@ -14,11 +14,13 @@ from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import free_motion
 from reconstruct.joint.faces import by_faces
 from reconstruct.joint.finish import (
+    APART_DEG,
     Finished,
     NoLink,
     Starts,
     Still,
     View,
+    apart_deg,
     bundle_of_state,
     finish,
 )
@@ -30,6 +32,7 @@ from reconstruct.joint.parallels import along_edges
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.plates import as_plate
+from reconstruct.joint.polish import residuals
 from reconstruct.joint.result import FREELY, MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
@@ -45,7 +48,7 @@ from reconstruct.joint.select import (
     worth,
 )
 from reconstruct.joint.slight import slight_motion
-from reconstruct.joint.sweep import SMALL, placed_on, sweep
+from reconstruct.joint.sweep import SMALL, Swept, placed_on, sweep
 from reconstruct.video import Video
 
 MOVING_SHARE = 0.012
@@ -58,6 +61,10 @@ DEPTHS = 0.68
 be what this share of the resting points stays under, one standard deviation."""
 STROKE_STDS = 8.0
 """Stroke over its standard deviation up to which two groups of tracks before a moving camera are one body."""
+DEPTHS_OF_LINK = np.exp(-np.linspace(np.log(0.7), np.log(2.8), 5))
+"""Of a link before a hand-held camera over the scene's, that are tried."""
+MISSED_PX = 0.3
+"""What a track costs at most by which joints of two sweeps are compared."""
 NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
 NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
 APART = "the camera moves, and hardly any frame shows the scene and the part together"
@@ -321,11 +328,51 @@ def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> 
     Args:
         paths: of all tracks, px from the principal point.
     """
-    if found.obs is None or np.ptp(global_profile(found.obs)) / found.obs.px > SMALL * camera.diagonal:
+    if found.obs is None or not _is_small(found, camera):
         return found.starts, found.members
     rivals = [bundle_of_state(*s, found.obs.frames) for several in found.starts.values() for s in several]
     swept = sweep(paths, found.moving, found.obs, found.members, rivals, view)
     return (found.starts, found.members) if swept is None else (swept.starts, swept.ids)
+
+
+def _is_small(found: _Consensus, camera: _Camera) -> bool:
+    """Whether the motion is one of which the search's pixels say too little."""
+    return found.obs is not None and np.ptp(global_profile(found.obs)) / found.obs.px <= SMALL * camera.diagonal
+
+
+def _swept_before_path(found: _Consensus, paths: Paths, view: View, depth: float, small: bool) -> Swept | None:
+    """The better joint of two sweeps, from the search's tracks and from all that leaves its place: in the compensated
+    picture what is near the camera goes as its parallax does, and the search may have found that.
+
+    Args:
+        paths: all tracks, px from the principal point, as filmed.  view: with the camera's path.
+        depth: the scene's, in its unit.  small: whether the motion is.
+
+    Returns:
+        None if too few tracks follow any joint, or if they follow one of the search's: of a large motion that one's
+        tracks are more.
+    """
+    if found.obs is None:
+        return None
+    rivals = [bundle_of_state(*s, found.obs.frames) for several in found.starts.values() for s in several]
+    every = view.sightings(paths[found.moving], np.arange(paths.uv.shape[1]))
+
+    def missed(swept: Swept) -> float:
+        """px, of all that leaves its place, MISSED_PX a track at most."""
+        b = placed_on(next(iter(swept.starts.values()))[0], every)
+        off = np.where(every.seen, np.linalg.norm(residuals(b, every), axis=-1), np.nan)
+        return float(np.sum(np.minimum(np.nanmedian(off[every.seen.any(1)], axis=1), MISSED_PX)))
+
+    tries = [
+        sweep(paths, found.moving, found.obs, pool, rivals, view, DEPTHS_OF_LINK * depth)
+        for pool in (found.members, found.moving)
+    ]
+    best = min((swept for swept in tries if swept is not None), key=missed, default=None)
+    if best is None or small:
+        return best
+    lead = next(iter(best.starts.values()))[0]
+    same = any(b.kind == lead.kind and apart_deg(b, lead) < APART_DEG for b in rivals)
+    return None if same else best
 
 
 def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, camera: _Camera
@@ -346,7 +393,13 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
         return finish(found.starts, still, found.members, view), restless, "; the camera moves: taken to its first view"
     leading = next(iter(found.starts.values()))[0]
     view, scene = scaled_to_link(path, leading, as_filmed, found.members, view)
-    done = finish(found.starts, as_filmed, found.members, view, scene)
+    starts, members = found.starts, found.members
+    depth = float(np.median(scene.X[:, 2]))
+    if (swept := _swept_before_path(found, as_filmed, view, depth, _is_small(found, camera))) is not None:
+        unit = float(np.median(next(iter(swept.starts.values()))[0].X[:, 2]))
+        starts = {kind: [b.scaled(1 / unit) for b in several] for kind, several in swept.starts.items()}
+        view, scene, members = replace(view, t=view.t / unit), replace(scene, X=scene.X / unit), swept.ids
+    done = finish(starts, as_filmed, members, view, scene)
     return done, path.sigma, "; the camera moves: its path is fitted together with the joint"
 
 
@@ -355,10 +408,10 @@ def _with_path(camera: _Camera, paths: Paths, warp: np.ndarray) -> _Camera:
     still, as_filmed = paths - camera.centre, replace(paths, uv=filmed(paths.uv, warp)) - camera.centre
     for _ in range(ROUNDS):
         rest = np.setdiff1d(np.arange(len(paths)), _moving(paths, camera))
-        path = path_from_rest(as_filmed.uv, still.uv, rest, camera.focal)
+        path = path_from_rest(as_filmed, still.uv, rest, camera.focal, camera.path)
         if path is None:
             break
-        camera = replace(camera, path=path, scene=at_rest(path, as_filmed.uv, still.uv, camera.focal))
+        camera = replace(camera, path=path, scene=at_rest(path, as_filmed, still.uv, camera.focal))
     return camera
 
 
@@ -479,7 +532,9 @@ def _consensus(paths: Paths, camera: _Camera, rng: np.random.Generator, tell: Ca
         if "revolute" in best:
             near = [h for h in ranked if h.kind == "revolute" and worth(h, obs) > RIVAL * value["revolute"]]
             starts["revolute"] += [(_redepth(h, link), link) for h in distinct(near, RIVALS)[1:]]
-        found = _Consensus(starts, moving[ids[follows]], total, _why_refused(s, every, follows) or "",
+        # What a free body follows better is asked at the end where the compensated picture bends what is near.
+        why = _why_refused(s, every, follows, camera.path is None) or ""
+        found = _Consensus(starts, moving[ids[follows]], total, why,
                            bool(follows.sum() < MIN_INLIERS), obs, moving)  # fmt: skip
         if not found.refusal:
             return found
@@ -499,11 +554,11 @@ def _redepth(s: State, obs: Observations) -> State:
     return solve_depths(replace(s, depth=np.ones(len(obs.ref))), obs)
 
 
-def _why_refused(s: State, obs: Observations, link: np.ndarray) -> str | None:
+def _why_refused(s: State, obs: Observations, link: np.ndarray, exact: bool) -> str | None:
     """A sentence if the best joint is not believable."""
     if link.sum() < MIN_INLIERS:
         return f"no joint: only {int(link.sum())} tracks agree with the best one ({s.kind})"
-    free = free_motion(s, obs)
+    free = free_motion(s, obs) if exact else None
     if free is not None and free.unexplained > FREE_SHARE:
         return (
             f"{FREELY}, not about one joint: {free.unexplained:.0%} of its points that move most "

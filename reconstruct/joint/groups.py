@@ -278,12 +278,12 @@ def paths_of_patch(x: np.ndarray, seen: np.ndarray, r: int, focal: float, keep: 
 
 
 def resect(X: np.ndarray, x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, focal: float, rounds: int,
-           scale: float = 4.0):  # fmt: skip
+           scale: float = 4.0, slip: np.ndarray | None = None):  # fmt: skip
     """Many poses from known points at once: robust Gauss-Newton from nearby starts.
 
     Args:
         X: (B or 1, n, 3) points.  x: (B or 1, n, 2) rays.  seen: (B or 1, n) bool.
-        R, t: (B, 3, 3), (B, 3) starts.  scale: of the loss, px.
+        R, t: (B, 3, 3), (B, 3) starts.  scale: of the loss, px.  slip: (B, n, 2) as in paths.py.
 
     Returns:
         R, t, and (B,) mean loss in [0, 1] (Geman-McClure).
@@ -292,12 +292,12 @@ def resect(X: np.ndarray, x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.
     for _ in range(rounds):
         Y = X @ np.swapaxes(R, -1, -2) + t[:, None]
         z = np.maximum(Y[..., 2], 1e-2)
-        r = (Y[..., :2] / z[..., None] - x) * focal
+        r = held((Y[..., :2] / z[..., None] - x) * focal, slip)
         w = seen * (scale**2 / (scale**2 + np.sum(r**2, axis=-1))) ** 2
         P = np.zeros((*z.shape, 2, 3))
         P[..., 0, 0] = P[..., 1, 1] = focal / z
         P[..., 0, 2], P[..., 1, 2] = -focal * Y[..., 0] / z**2, -focal * Y[..., 1] / z**2
-        J = np.concatenate([P @ -skew(Y - t[:, None]), P], axis=-1)
+        J = held(np.concatenate([P @ -skew(Y - t[:, None]), P], axis=-1), slip)
         flat = J.reshape(len(J), -1, 6)
         wJ = (w[..., None, None] * J).reshape(len(J), -1, 6)
         H = np.swapaxes(wJ, 1, 2) @ flat
@@ -308,27 +308,28 @@ def resect(X: np.ndarray, x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.
         d *= np.minimum(1, 0.3 / np.maximum(np.abs(d).max(1, keepdims=True), 1e-9))
         R, t = Rotation.from_rotvec(d[:, :3]).as_matrix() @ R, t + d[:, 3:]
     Y = X @ np.swapaxes(R, -1, -2) + t[:, None]
-    r2 = np.sum(((Y[..., :2] / np.maximum(Y[..., 2:], 1e-2) - x) * focal) ** 2, axis=-1)
+    r2 = np.sum(held((Y[..., :2] / np.maximum(Y[..., 2:], 1e-2) - x) * focal, slip) ** 2, axis=-1)
     loss = np.sum(seen * r2 / (scale**2 + r2), axis=1) / np.maximum(np.sum(seen + 0 * r2, axis=1), 1)
     return R, t, loss
 
 
 def triangulated(x: np.ndarray, seen: np.ndarray, R: np.ndarray, t: np.ndarray, X: np.ndarray | None = None,
-                  px: float = 0.006) -> np.ndarray:  # fmt: skip
+                  px: float = 0.006, slip: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
     """(N, 3) points from poses: linear over all frames, reweighted by depth and residual.
 
     Args:
         px: scale of the residual's weight, ray units.  X: starts; from the rays alone when None.
+        slip: (N, K, 2) as in paths.py.
     """
     x = np.nan_to_num(x)
-    rows = x[..., :, None] * R[None, :, 2:3] - R[None, :, :2]  # (N, K, 2, 3): row . X = t_xy - x t_z
-    rhs = t[None, :, :2] - x * t[None, :, 2:]
+    rows = held(x[..., :, None] * R[None, :, 2:3] - R[None, :, :2], slip)  # (N, K, 2, 3): row . X = t_xy - x t_z
+    rhs = held(t[None, :, :2] - x * t[None, :, 2:], slip)
     for sweep in range(3 if X is None else 2):
         w = seen.astype(float)
         if X is not None:
             Y = np.einsum("kij,nj->nki", R, X) + t
             z = np.maximum(Y[..., 2:], 1e-2)
-            e2 = np.sum((Y[..., :2] / z - x) ** 2, axis=-1)
+            e2 = np.sum(held(Y[..., :2] / z - x, slip) ** 2, axis=-1)
             w = w / z[..., 0] ** 2 / (1 + e2 / (px * (4.0, 2.0, 1.0)[min(sweep, 2)]) ** 2) ** 2
         wr = w[..., None, None] * rows
         A = wr.reshape(len(x), -1, 3).swapaxes(1, 2) @ rows.reshape(len(x), -1, 3)

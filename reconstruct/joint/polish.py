@@ -118,6 +118,12 @@ class Bundle:
     R: np.ndarray | None = None
     t: np.ndarray | None = None
 
+    def scaled(self, by: float) -> Bundle:
+        """The same in another unit of length."""
+        tw = self.twist
+        twist = Twist(tw.anchor * by, tw.direction, tw.curvature / by)
+        return replace(self, twist=twist, q=self.q * by, X=self.X * by, t=None if self.t is None else self.t * by)
+
 
 def parallel_deg(s: Sightings) -> float:
     """Standard deviation, to either side, of an axis about what it is taken to be parallel to.

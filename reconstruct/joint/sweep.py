@@ -55,7 +55,8 @@ class Swept:
 
 
 def sweep(
-    paths: Paths, moving: np.ndarray, obs: Observations, members: np.ndarray, rivals: Sequence[Bundle], view: View
+    paths: Paths, moving: np.ndarray, obs: Observations, members: np.ndarray, rivals: Sequence[Bundle], view: View,
+    depths: Sequence[float] = (1.0,),
 ) -> Swept | None:
     """The joint that fits best at the noise of the tracks, whatever the search said.
 
@@ -63,7 +64,8 @@ def sweep(
         paths: N tracks, px from the principal point.  moving: (m,) tracks that leave their place.
         obs: the search's observations, for its key frames.  members: (n,) tracks that the search took for the link.
         rivals: the search's joints, with these points and the states of the key frames; they compete.
-        view: focal length; the camera rests.
+        view: focal length, and the camera's path where it moves.
+        depths: of the link that are tried, in the unit of that path.
 
     Returns:
         None if too few tracks follow any joint.
@@ -73,15 +75,14 @@ def sweep(
     pool, found = members, None
     field = [replace(b, q=b.q[some] - b.q[some[0]]) for b in rivals]
     for _ in range(SWEEPS):
-        flow = flow_of(paths[pool], view.focal)
-        ways = [] if flow is None else candidates(flow, HINGES, SLIDES)
+        ways = _ways(paths[pool], view, depths)
         # Tracks that follow any of them: what follows none is no evidence.
-        good = np.flatnonzero(np.any([c.good for c in ways], axis=0)) if ways else []
-        if flow is None or len(good) < FEWEST:
+        good = np.unique(np.concatenate([np.zeros(0, int), *(w.flow.ids[w.joint.good] for w in ways)]))
+        if len(good) < FEWEST:
             break
         pick = good[_evenly(len(good), TRACKS)]
-        sight = view.sightings(paths[pool[flow.ids[pick]]], keys, lasting=100.0)
-        several = _narrowed([start_of(c, flow, pick, keys) for c in ways] + [placed_on(b, sight) for b in field], sight)
+        sight = view.sightings(paths[pool[pick]], keys, lasting=100.0)
+        several = _narrowed([w.start(pick, keys, sight) for w in ways] + [placed_on(b, sight) for b in field], sight)
         lead = several[0]
         if found is not None and lead.sigma > SHARPER * found[0].sigma:
             break
@@ -92,7 +93,7 @@ def sweep(
         if len(more[0]) < FEWEST:
             break
         both = np.unique(np.concatenate(more))
-        few_strays = np.isin(pool[flow.ids[pick]], both).mean() > CLEAN
+        few_strays = np.isin(pool[pick], both).mean() > CLEAN
         pool, found, field = both, several, [lead]
         if few_strays:
             break
@@ -107,6 +108,32 @@ def sweep(
             # Every joint has its own points: those of another would lead it into that one's optimum.
             first.append(states_of_all_frames(placed_on(b, sight), every, keys))
     return Swept(starts, pool)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A joint as the velocities of tracks show it that are seen from the first camera's place at one depth."""
+
+    joint: Candidate
+    flow: Flow
+    depth: float
+
+    def start(self, pick: np.ndarray, keys: np.ndarray, sight: Sightings) -> Bundle:
+        """In the frames `keys`, with the points of the tracks ``pick`` (n,), of which ``sight`` is in these frames."""
+        at = np.searchsorted(self.flow.ids, pick).clip(max=len(self.flow.ids) - 1)
+        known = self.flow.ids[at] == pick
+        b = start_of(self.joint, self.flow, at[known], keys).scaled(self.depth)
+        return b if known.all() else placed_on(b, sight)
+
+
+def _ways(paths: Paths, view: View, depths: Sequence[float]) -> list[_Way]:
+    """Every way to move that velocities show, with the link at any of these depths."""
+    out = []
+    for depth in depths:
+        flow = flow_of(view.at_first(paths, depth), view.focal)
+        if flow is not None and len(flow.ids) >= FEWEST:
+            out += [_Way(c, flow, depth) for c in candidates(flow, HINGES, SLIDES)]
+    return out
 
 
 def _evenly(count: int, most: int) -> np.ndarray:

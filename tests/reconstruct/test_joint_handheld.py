@@ -8,14 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import ProviderInfo, Tracks
-from reconstruct.joint.finish import Still, View, calmer
+from reconstruct.joint.finish import Still, View, _costs, _hinge_of_screw, calmer, turn_deg
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.handheld import at_rest, filmed, path_from_rest
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.paths import Paths
-from reconstruct.joint.polish import Bundle, Sightings, polish
+from reconstruct.joint.polish import Bundle, Sightings, polish, residuals
+from reconstruct.joint.select import key_frames, observations
 from reconstruct.joint.shape import NEARBY, Nearby, Reach
-from reconstruct.joint.twist import Twist
+from reconstruct.joint.sweep import sweep
+from reconstruct.joint.twist import Twist, twist_of_joint
 from tests.reconstruct.joint_scenes import FOCAL, H, W, make_video, project
 
 CENTRE = np.array([(W - 1) / 2, (H - 1) / 2])
@@ -33,17 +35,20 @@ def camera_path(frames, rng):
     return R, -np.einsum("tij,tj->ti", R, sway[:, :3])
 
 
-def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0):
-    """Tracks of a door before a desk and a wall, in the picture that the wall's homographies take to its first view."""
+def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, turn=0.9, slant=(0.0, 0.0)):
+    """Tracks of a door before a desk and a wall, in the picture that the wall's homographies take to its first view.
+
+    turn: of the door, rad.  slant: of the wall, depth over what is beside and above."""
     rng = np.random.default_rng(seed)
     R, t = camera_path(FRAMES, rng)
     half = rest // 2
     wall = np.column_stack([rng.uniform(-1.2, 1.2, half), rng.uniform(-0.7, 0.5, half), np.full(half, 2.2)])
+    wall[:, 2] += wall[:, :2] @ slant
     desk = np.column_stack([rng.uniform(-0.5, 0.5, half), np.full(half, 0.25), rng.uniform(0.9, 1.8, half)])
     still = np.concatenate([wall, desk])
     door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (link, 3))
     s = np.clip((np.arange(FRAMES) - 6) / (FRAMES - 12), 0, 1)
-    q = 0.9 * (3 * s**2 - 2 * s**3)
+    q = turn * (3 * s**2 - 2 * s**3)
     if body == "hinge":
         pose = joint_transform("revolute", AXIS, POINT, -q)
     else:  # carried away on a curve
@@ -69,9 +74,13 @@ def angle(fit):
 def test_the_path_is_known_from_what_rests():
     tracks, warp, (R, t), _ = scene()
     flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
-    path = path_from_rest(filmed(flat, warp) - CENTRE, flat - CENTRE, np.arange(160), FOCAL)
+    path = path_from_rest(Paths(filmed(flat, warp) - CENTRE), flat - CENTRE, np.arange(160), FOCAL)
     assert path is not None and len(path.ids) > 140
     assert path.sigma == pytest.approx(0.1, rel=0.15)
+    assert_path(path, R, t)
+
+
+def assert_path(path, R, t):
     centre = lambda R, t: -np.einsum("tji,tj->ti", R, t)  # noqa: E731
     found, true = centre(path.R, path.t), centre(R, t)
     found *= np.sum(found * true) / np.sum(found**2)  # the scale is free
@@ -79,11 +88,52 @@ def test_the_path_is_known_from_what_rests():
     assert np.degrees(Rotation.from_matrix(path.R @ np.swapaxes(R, 1, 2)).magnitude()).max() < 0.1
 
 
+@pytest.mark.parametrize("slant", [(0.8, 0.0), (-0.8, 0.6), (0.0, -0.8)])
+def test_a_wall_that_is_seen_aslant_tells_the_path_too(slant):
+    """Of the wall alone, and from the tracks of all that is followed it is known which of the starts is right."""
+    tracks, warp, (R, t), _ = scene(slant=slant, noise=0.05)
+    flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
+    paths = Paths(filmed(flat, warp) - CENTRE)
+    path = path_from_rest(paths, flat - CENTRE, np.arange(80), FOCAL)
+    assert path is not None
+    path = path_from_rest(paths, flat - CENTRE, at_rest(path, paths, flat - CENTRE, FOCAL), FOCAL, path)
+    assert path is not None
+    assert_path(path, R, t)
+
+
+def test_points_that_slide_along_edges_hold_the_path_across_them():
+    """Half of what rests slides by up to 5 px along its edge, which the tracks say."""
+    tracks, warp, (R, t), _ = scene(noise=0.05)
+    flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
+    rng = np.random.default_rng(1)
+    edge = rng.normal(size=(len(flat), 1, 2))
+    edge /= np.linalg.norm(edge, axis=-1, keepdims=True)
+    edge[::2] = 0.0
+    uv = filmed(flat, warp) - CENTRE + edge * rng.uniform(-5, 5, (*flat.shape[:2], 1))
+    slides = Paths(uv, np.broadcast_to(0.999 * edge, uv.shape))
+    path = path_from_rest(slides, flat - CENTRE, np.arange(160), FOCAL)
+    assert path is not None and len(path.ids) > 140 and path.sigma < 0.1
+    assert_path(path, R, t)
+    path = path_from_rest(Paths(uv), flat - CENTRE, np.arange(160), FOCAL)
+    assert path is None or len(path.ids) < 120 or path.sigma > 0.5
+
+
+def test_short_tracks_hold_a_path_that_no_long_ones_do():
+    """Every point is followed for five of 36 frames only, as where hands and fast motion cut tracks."""
+    tracks, warp, (R, t), _ = scene(noise=0.03, rest=600)
+    flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
+    begin = np.random.default_rng(2).integers(0, FRAMES - 4, len(flat))
+    flat[(np.arange(FRAMES) < begin[:, None]) | (np.arange(FRAMES) > begin[:, None] + 4)] = np.nan
+    path = path_from_rest(Paths(filmed(flat, warp) - CENTRE), flat - CENTRE, np.arange(600), FOCAL)
+    assert path is not None
+    assert np.degrees(Rotation.from_matrix(path.R @ np.swapaxes(R, 1, 2)).magnitude()).max() < 0.3
+
+
 def test_what_drifts_by_parallax_rests_and_a_door_does_not():
     """The wall tells the path; the desk is up to twice as near and leaves its place in the picture by pixels."""
     tracks, warp, _, _ = scene()
     flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
-    uv, still = filmed(flat, warp) - CENTRE, flat - CENTRE
+    uv, still = Paths(filmed(flat, warp) - CENTRE), flat - CENTRE
     path = path_from_rest(uv, still, np.arange(80), FOCAL)
     assert path is not None
     drift = np.nanmax(np.linalg.norm(still - still[:, :1], axis=-1), axis=1)
@@ -101,7 +151,7 @@ def test_a_scene_keeps_to_the_scale_of_the_path():
     tracks, warp, _, _ = scene()
     flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
     uv = filmed(flat, warp) - CENTRE
-    path = path_from_rest(uv, flat - CENTRE, np.arange(160), FOCAL)
+    path = path_from_rest(Paths(uv), flat - CENTRE, np.arange(160), FOCAL)
     assert path is not None
     longer = Still(path.ids, path.X).before(View(FOCAL, 0.0, path.R, 2.5 * path.t), Paths(uv), 0.0)
     np.testing.assert_array_equal(longer.ids, path.ids)
@@ -126,6 +176,106 @@ def test_a_door_before_a_hand_held_camera_is_as_exact_as_its_tracks():
     assert "its path is fitted" in fit.reason
     assert angle(fit) < min(0.3, 3 * fit.std["axis_deg"])
     assert np.abs(fit.q - q).max() < 0.01
+
+
+def test_a_door_that_opens_a_little_is_found_before_a_path_without_any_guess():
+    """Tracks of the desk drift by half of what the door goes; before a camera at rest no joint is found."""
+    tracks, warp, (R, t), _ = scene(turn=0.12, noise=0.06, link=80)
+    flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
+    paths, moving = Paths(filmed(flat, warp) - CENTRE), np.r_[80:100, 160:240]
+    keys = key_frames(flat[moving])
+    rng, diagonal = np.random.default_rng(0), float(np.hypot(W, H))
+    obs = observations(Paths(flat[moving]), FOCAL, CENTRE, keys, 260, rng, diagonal)[0]
+
+    def errs(view, depths):
+        found = sweep(paths, moving, obs, moving, [], view, depths)
+        if found is None:
+            return np.zeros(0, int), np.inf, np.inf
+        b = polish(found.starts["revolute"][0], view.sightings(paths[found.ids], np.arange(FRAMES)))
+        return found.ids, b.sigma, np.degrees(np.arccos(min(1.0, abs(b.twist.axis @ AXIS))))
+
+    ids, sigma, off = errs(View(FOCAL, 0.0, R, t), (0.5, 1.0, 1.8))
+    assert (ids >= 160).mean() > 0.9 and len(ids) > 60
+    assert sigma < 0.08 and off < 2
+    ids, sigma, off = errs(View(FOCAL), (1.0,))
+    assert len(ids) < 60 or sigma > 0.15 or off > 10
+
+
+def test_a_door_that_opens_a_little_before_a_hand_held_camera_is_a_sure_hinge():
+    tracks, warp, _, q = scene(turn=0.12, noise=0.06, link=80)
+    fit = fit_joint(replace(make_video(FRAMES), warp=warp), tracks, FOCAL, camera_moving=False)
+    assert fit.type == "revolute" and fit.verdict == "ok", fit.reason
+    assert angle(fit) < min(6, 3 * fit.std["axis_deg"])
+    assert np.abs(fit.q - q).max() < 0.02
+
+
+def test_from_the_first_place_points_at_one_depth_do_not_drift():
+    rng = np.random.default_rng(0)
+    R, t = camera_path(FRAMES, rng)
+    view = View(FOCAL, 0.0, R, t)
+    # Points that are 1.5 before each camera as it goes: where they are in the world the first one sees.
+    uv = rng.uniform(-200, 200, (30, FRAMES, 2))
+    X = np.concatenate([uv / FOCAL, np.ones((30, FRAMES, 1))], axis=-1) * 1.5
+    world = np.einsum("tji,ntj->nti", R, X - t)
+    seen = view.at_first(Paths(uv), 1.5)
+    np.testing.assert_allclose(seen.uv, FOCAL * world[..., :2] / world[..., 2:], atol=1e-6)
+    resting = Paths(uv)
+    assert View(FOCAL).at_first(resting, 2.0) is resting
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_joint_in_another_unit_is_the_same_in_the_picture(kind):
+    R, t = camera_path(FRAMES, np.random.default_rng(0))
+    curvature = np.array([0.0, 2.0, 0]) if kind == "revolute" else np.zeros(3)
+    X = np.random.default_rng(1).uniform([-0.2, -0.2, 0.9], [0.2, 0.2, 1.1], (20, 3))
+    b = Bundle(kind, Twist(np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), curvature), np.linspace(0, 0.2, FRAMES), X)
+    s = Sightings(np.zeros((20, FRAMES, 2)), np.ones((20, FRAMES), bool), np.ones(20), FOCAL, R=R, t=t)
+    far = b.scaled(2.5)
+    np.testing.assert_allclose(residuals(far, replace(s, t=2.5 * t)), residuals(b, s), atol=1e-9)
+    assert turn_deg(far) == pytest.approx(turn_deg(b))
+    np.testing.assert_allclose(replace(b, R=R, t=t).scaled(2.5).t, 2.5 * t)
+
+
+def test_a_hinge_that_lost_its_path_is_the_screws_own():
+    """Before a camera that is fitted too a hinge and a screw of the same motion may end on different paths."""
+    tracks, warp, (R, t), q = scene(noise=0.05, link=60)
+    uv = filmed(tracks.uv.astype(float), warp) - CENTRE
+    link = np.arange(len(uv)) >= 160
+    rng = np.random.default_rng(0)
+    pose = joint_transform("revolute", AXIS, POINT, -q)
+    half = 80
+    wall = np.column_stack([rng.uniform(-1.2, 1.2, half), rng.uniform(-0.7, 0.5, half), np.full(half, 2.2)])
+    desk = np.column_stack([rng.uniform(-0.5, 0.5, half), np.full(half, 0.25), rng.uniform(0.9, 1.8, half)])
+    door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (60, 3))
+    X = np.concatenate([wall, desk, door])
+    moving = np.einsum("tij,nj->nti", pose[:, :3, :3], door) + pose[:, :3, 3]
+    world = np.concatenate([np.repeat(X[:160, None], FRAMES, axis=1), moving])
+    uv = project(np.einsum("tij,ntj->nti", R, world) + t) - CENTRE + rng.normal(0, 0.05, (len(X), FRAMES, 2))
+    twist, speed = twist_of_joint("revolute", -AXIS, POINT, door.mean(0))
+    s = Sightings(uv, np.ones(uv.shape[:2], bool), np.ones(len(uv)), FOCAL, R=R, t=t, link=link, free=True)
+    right = polish(Bundle("screw", twist, q * speed, X, R=R, t=t), s)
+    bent = replace(twist, curvature=-0.5 * twist.curvature)
+    lost = replace(right, kind="revolute", twist=bent, q=right.q[::-1] * 0.5 - right.q[-1] * 0.5, cost=1e6, sigma=20.0)
+    found = _hinge_of_screw({"revolute": lost, "screw": right}, s)["revolute"]
+    assert found.kind == "revolute" and found.sigma < 0.07
+    assert np.degrees(np.arccos(min(1, abs(found.twist.axis @ AXIS)))) < 0.5
+    same = {"revolute": found, "screw": replace(right, cost=2 * found.cost)}
+    assert _hinge_of_screw(same, s) is same
+
+
+def test_points_out_of_all_proportion_explain_nothing_before_a_moving_camera_either():
+    """A slide that puts a third of its points behind the camera, beside a scene that may be as far away as it likes."""
+    T, link = 20, np.arange(60) < 30
+    X = np.random.default_rng(0).uniform([-0.2, -0.2, 0.9], [0.2, 0.2, 1.1], (60, 3))
+    X[~link, 2] += 8.0
+    wide = X.copy()
+    wide[:10, 2] = -0.5
+    s = Sightings(np.zeros((60, T, 2)), np.ones((60, T), bool), np.ones(60), FOCAL, link=link)
+    near = Bundle("revolute", Twist(np.zeros(3), np.array([1.0, 0, 0]), np.zeros(3)), np.zeros(T), X, sigma=0.1)
+    s = replace(s, uv=near.X[:, None, :2].repeat(T, axis=1) / near.X[:, None, 2:] * FOCAL)
+    costs, others = _costs(near, replace(near, kind="prismatic", X=wide), s)
+    assert costs.max() < 1e-6 and not others[10:].any()
+    np.testing.assert_allclose(others[:10], (0.4**2) * T)
 
 
 def test_a_link_that_errs_does_not_bend_the_path():
