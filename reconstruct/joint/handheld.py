@@ -27,8 +27,8 @@ MOST, KEYS = 250, 50
 FACING = np.array([[x, y, 1.0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)])
 """Normals of the flat scenes that it starts from, in FEW_KEYS frames or a few more."""
 FEW_KEYS = 24
-JUDGES, STRANGE_PX = 1000, 0.3
-"""Tracks by which these are compared, and what each costs at most: what moves is missed by all of them."""
+STRANGE_PX = 0.3
+"""What a track costs at most by which their ends are compared."""
 WIDE_PX = (20.0, 5.0, 1.5)
 """Scales of the loss while the scene is still taken for flat: at first parallax is no outlier."""
 LEAST_PX, WIDE_SIGMAS = 0.05, 4.0
@@ -84,19 +84,16 @@ def path_from_rest(paths: Paths, still: np.ndarray, rest: np.ndarray, focal: flo
         None where fewer than LEAST tracks last, or some frame sees fewer than MIN_SEEN of them.
     """
     T = paths.uv.shape[1]
-    shown = paths.seen.mean(1)
-    share = _lasting(paths[rest].seen)
-    ids = rest[shown[rest] >= share]
+    seen = paths[rest].seen
+    share = _lasting(seen)
+    ids = rest[seen.mean(1) >= share]
     if len(ids) < LEAST:
         return None
     scene = _Rays(paths[ids], focal)
     keys = np.unique(np.linspace(0, T - 1, KEYS).round().astype(int))
     # Of short tracks too few frames see too little.
     few = keys[::2] if len(keys) > FEW_KEYS and share == LASTING[0] else keys
-    every = np.flatnonzero(shown >= share)
-    every = every[np.unique(np.linspace(0, len(every) - 1, min(len(every), JUDGES)).round().astype(int))]
-    rough = _begun(scene.at(few), np.nanmedian(still[ids], axis=1), known and (known.R[few], known.t[few]),
-                   _Rays(paths[every], focal).at(few))  # fmt: skip
+    rough = _begun(scene.at(few), np.nanmedian(still[ids], axis=1), known and (known.R[few], known.t[few]))
     if rough.good.sum() < LEAST:
         return None
     at_keys, (R, t, X), good = scene.at(keys), rough.start, rough.good
@@ -118,21 +115,21 @@ def _lasting(seen: np.ndarray) -> float:
     return next(many, LASTING[-1])
 
 
-def _begun(scene: _Rays, middle: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None, judges: _Rays) -> _Settled:
-    """The path that leaves the least of all that is followed, the nearest of what rests among it.
+def _begun(scene: _Rays, middle: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None) -> _Settled:
+    """The path that the scene misses least, of several that start from a flat one.
 
-    Each starts from a flat scene. Which way that faces is hardly seen, and from the wrong side the adjustment ends
-    where turns and steps of the camera are taken for each other.
+    Which way that faces is hardly seen, and from the wrong side the adjustment ends where turns and steps of the camera
+    are taken for each other.
 
     Args:
         scene: what rests.  middle: (m, 2) px, where the compensated picture has it.
-        known: another start, R (T, 3, 3) and t (T, 3).  judges: all that is followed.
+        known: another start, R (T, 3, 3) and t (T, 3).
     """
     rays = np.concatenate([middle / scene.focal, np.ones((len(middle), 1))], axis=1)
     starts = [scene.before_plane(rays / (rays @ normal)[:, None]) for normal in FACING]
     if known is not None:
         starts.append((*known, scene.points(*known)))
-    return min((scene.settled(start, rounds=2) for start in starts), key=lambda s: judges.missed(*s.start))
+    return min((scene.settled(start, rounds=2) for start in starts), key=lambda s: scene.missed(*s.start))
 
 
 @dataclass(frozen=True)
@@ -184,11 +181,8 @@ class _Rays:
         return R, t, X
 
     def missed(self, R: np.ndarray, t: np.ndarray, X: np.ndarray) -> float:
-        """px, by which the tracks miss points of their own at rest before a path, STRANGE_PX each at most; X (m, 3):
-        the scene's, which say how near the camera a point may be."""
-        own = self.points(R, t)
-        off = np.where(own[:, 2] > nearest(X), self.off(R, t, own), np.inf)
-        return float(np.sum(np.minimum(off, STRANGE_PX)))
+        """px, by which the tracks miss their points before a path, STRANGE_PX each at most."""
+        return float(np.sum(np.minimum(np.where(X[:, 2] > nearest(X), self.off(R, t, X), np.inf), STRANGE_PX)))
 
     def off(self, R: np.ndarray, t: np.ndarray, X: np.ndarray) -> np.ndarray:
         """(n,) median residual of a coordinate's standard deviation, px; infinite where hardly seen."""
@@ -235,7 +229,7 @@ def at_rest(path: Path, paths: Paths, still: np.ndarray, focal: float) -> np.nda
 
 
 def nearest(X: np.ndarray) -> float:
-    """Depth from which on a track is taken for a point at rest, beside the scene's points (m, 3)."""
+    """Depth from which on a track is taken for a point at rest, beside a scene's points (m, 3)."""
     return NEARER * float(np.quantile(X[:, 2], 0.05))
 
 
