@@ -223,8 +223,12 @@ class View:
         return s if self.R is None else replace(s, R=self.R[s.frames], t=self.t[s.frames])
 
     def at_first(self, paths: Paths, depth: float) -> Paths:
-        """Tracks, px from the principal point, as a camera that stays in the first one's place would see them if all
-        were at one depth before the camera that did."""
+        """Tracks as a camera that stays in the first one's place would see them, if all were at one depth before the
+        camera that did; themselves where that rests.
+
+        Args:
+            paths: N tracks in T frames, px from the principal point.  depth: in the unit of t.
+        """
         if self.R is None or self.t is None:
             return paths
         x = np.concatenate([paths.uv / self.focal, np.ones((*paths.uv.shape[:2], 1))], axis=-1) * depth

@@ -32,7 +32,7 @@ from reconstruct.joint.parallels import along_edges
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.plates import as_plate
-from reconstruct.joint.polish import residuals
+from reconstruct.joint.polish import Bundle, residuals
 from reconstruct.joint.result import FREELY, MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
@@ -330,8 +330,7 @@ def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> 
     """
     if found.obs is None or not _is_small(found, camera):
         return found.starts, found.members
-    rivals = [bundle_of_state(*s, found.obs.frames) for several in found.starts.values() for s in several]
-    swept = sweep(paths, found.moving, found.obs, found.members, rivals, view)
+    swept = sweep(paths, found.moving, found.obs, found.members, found.bundles(found.obs), view)
     return (found.starts, found.members) if swept is None else (swept.starts, swept.ids)
 
 
@@ -354,7 +353,7 @@ def _swept_before_path(found: _Consensus, paths: Paths, view: View, depth: float
     """
     if found.obs is None:
         return None
-    rivals = [bundle_of_state(*s, found.obs.frames) for several in found.starts.values() for s in several]
+    rivals = found.bundles(found.obs)
     every = view.sightings(paths[found.moving], np.arange(paths.uv.shape[1]))
 
     def missed(swept: Swept) -> float:
@@ -459,6 +458,10 @@ class _Consensus:
     obs: Observations | None = None
     moving: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
+    def bundles(self, obs: Observations) -> list[Bundle]:
+        """All its joints in the frames of these observations, each with the points of the tracks that follow."""
+        return [bundle_of_state(*s, obs.frames) for several in self.starts.values() for s in several]
+
 
 def _paths(video: Video, tracks: Tracks) -> Paths:
     """The tracks in working px."""
@@ -555,7 +558,8 @@ def _redepth(s: State, obs: Observations) -> State:
 
 
 def _why_refused(s: State, obs: Observations, link: np.ndarray, exact: bool) -> str | None:
-    """A sentence if the best joint is not believable."""
+    """A sentence if the best joint is not believable; exact: whether the picture is one that a free body can be asked
+    of."""
     if link.sum() < MIN_INLIERS:
         return f"no joint: only {int(link.sum())} tracks agree with the best one ({s.kind})"
     free = free_motion(s, obs) if exact else None

@@ -25,8 +25,9 @@ LASTING = (0.25, 0.15, 0.08)
 MOST, KEYS = 250, 50
 """Tracks and frames of one adjustment; the other frames are placed against its points."""
 FACING = np.array([[x, y, 1.0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)])
-"""Normals of the flat scenes that it starts from, in FEW_KEYS frames or a few more."""
+"""Normals of the flat scenes that it starts from."""
 FEW_KEYS = 24
+"""Key frames beyond which every other one is enough to tell these starts apart."""
 STRANGE_PX = 0.3
 """What a track costs at most by which their ends are compared."""
 WIDE_PX = (20.0, 5.0, 1.5)
@@ -182,7 +183,7 @@ class _Rays:
 
     def missed(self, R: np.ndarray, t: np.ndarray, X: np.ndarray) -> float:
         """px, by which the tracks miss their points before a path, STRANGE_PX each at most."""
-        return float(np.sum(np.minimum(np.where(X[:, 2] > nearest(X), self.off(R, t, X), np.inf), STRANGE_PX)))
+        return float(np.sum(np.minimum(np.where(X[:, 2] > _nearest(X), self.off(R, t, X), np.inf), STRANGE_PX)))
 
     def off(self, R: np.ndarray, t: np.ndarray, X: np.ndarray) -> np.ndarray:
         """(n,) median residual of a coordinate's standard deviation, px; infinite where hardly seen."""
@@ -225,10 +226,10 @@ def at_rest(path: Path, paths: Paths, still: np.ndarray, focal: float) -> np.nda
     left = np.zeros(len(paths))
     left[some] = np.nanmedian(np.linalg.norm(still[some] - np.nanmedian(still[some], axis=1)[:, None], axis=-1), axis=1)
     explained = off < np.maximum(STRAY * max(path.sigma, LEAST_PX), EXPLAINED * left)
-    return np.flatnonzero(explained & (X[:, 2] > nearest(path.X)))
+    return np.flatnonzero(explained & (X[:, 2] > _nearest(path.X)))
 
 
-def nearest(X: np.ndarray) -> float:
+def _nearest(X: np.ndarray) -> float:
     """Depth from which on a track is taken for a point at rest, beside a scene's points (m, 3)."""
     return NEARER * float(np.quantile(X[:, 2], 0.05))
 

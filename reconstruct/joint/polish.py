@@ -119,7 +119,7 @@ class Bundle:
     t: np.ndarray | None = None
 
     def scaled(self, by: float) -> Bundle:
-        """The same in another unit of length."""
+        """The same in another unit of length; by: new units that the old one is long."""
         tw = self.twist
         twist = Twist(tw.anchor * by, tw.direction, tw.curvature / by)
         return replace(self, twist=twist, q=self.q * by, X=self.X * by, t=None if self.t is None else self.t * by)
