@@ -25,7 +25,7 @@ DEGREE = 4
 """Of the polynomials that a smooth path follows."""
 LEAST_RATIO = 0.05
 """Of the link's scale to the scene's that is believed of a hinge between noisy paths."""
-TELLS = 5.0
+TELLS = 10.0
 """Log-likelihood by which a path has to be smoother to be the one before the scene."""
 
 

@@ -601,13 +601,17 @@ def _across_kinds(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bundle
     }
 
 
+FAR = 60
+"""Iterations in which a hinge that begins as a screw without its pitch gets rid of what that had explained."""
+
+
 def _hinge_of_screw(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bundle]:
     """The same with the screw's own hinge where that is the better one: before a camera that is fitted too the two may
     have ended on different paths."""
     screw, hinge = best.get("screw"), best["revolute"]
     if screw is None or screw.cost >= hinge.cost:
         return best
-    own = polish(replace(screw, kind="revolute", twist=screw.twist.moved(np.zeros(6), "revolute")), sight)
+    own = polish(replace(screw, kind="revolute", twist=screw.twist.moved(np.zeros(6), "revolute")), sight, FAR)
     better = own.cost + radius_cost(own, sight) < hinge.cost + radius_cost(hinge, sight)
     return {**best, "revolute": own} if better else best
 

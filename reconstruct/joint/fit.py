@@ -86,7 +86,7 @@ FREE_SHARE = 1 / 4
 and slides, with flexing parts, drifting tracks and an imperfect camera, leave 0 to 0.15; what is lifted away leaves
 0.3 and more, though shadows that swing with the arm make a hinge of a part of it."""
 
-ROUNDS = 3
+ROUNDS = 5
 """Of a hand-held camera's path and the tracks that it explains: points off the plane of the compensation leave their
 place in the picture until they are known to rest."""
 TRIES = 3
@@ -405,13 +405,20 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
 def _with_path(camera: _Camera, paths: Paths, warp: np.ndarray) -> _Camera:
     """The camera with its path and the scene that this explains, where enough rests in the compensated picture."""
     still, as_filmed = paths - camera.centre, replace(paths, uv=filmed(paths.uv, warp)) - camera.centre
+    keeps = np.setdiff1d(np.arange(len(paths)), _moving(paths, camera))
+    path, rest = None, keeps
     for _ in range(ROUNDS):
-        rest = np.setdiff1d(np.arange(len(paths)), _moving(paths, camera))
-        path = path_from_rest(as_filmed, still.uv, rest, camera.focal, camera.path)
-        if path is None:
+        further = path_from_rest(as_filmed, still.uv, rest, camera.focal, path)
+        if further is None:
             break
-        camera = replace(camera, path=path, scene=at_rest(path, as_filmed, still.uv, camera.focal))
-    return camera
+        # A part that the path explains by and by takes it over.
+        path, before = further, rest
+        rest = np.union1d(keeps, at_rest(path, as_filmed, still.uv, camera.focal, missed=0.0))
+        if np.array_equal(rest, before):
+            break
+    if path is None:
+        return camera
+    return replace(camera, path=path, scene=at_rest(path, as_filmed, still.uv, camera.focal))
 
 
 @dataclass(frozen=True)

@@ -28,14 +28,17 @@ FACING = np.array([[x, y, 1.0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)])
 """Normals of the flat scenes that it starts from."""
 FEW_KEYS = 24
 """Key frames beyond which every other one is enough to tell these starts apart."""
-STRANGE_PX = 0.3
-"""What a track costs at most by which their ends are compared."""
+STRANGE_PX = 0.1
+"""What a track costs at most by which their ends are compared: a part near its hinge is not much further off."""
 WIDE_PX = (20.0, 5.0, 1.5)
 """Scales of the loss while the scene is still taken for flat: at first parallax is no outlier."""
 LEAST_PX, WIDE_SIGMAS = 0.05, 4.0
 """Noise that is believed, and the scale of the loss in it."""
 STRAY = 3.0
 """Standard deviations by which a resting track's median residual may be off."""
+CORE, CORE_OF_NOISE = 0.25, 1.2
+"""Share of the tracks that follow a path best, and the noise over what the last of them is off. The noise of all that
+follows grows with what does not rest among it, and lets more of that in."""
 RATIOS = np.exp(np.linspace(np.log(0.4), np.log(3.0), 9))
 """Depth of the scene over the link's, from which the adjustment of both starts."""
 FEW_FRAMES, COARSE_PX = 40, 3.0
@@ -196,7 +199,10 @@ class _Rays:
 
     def settled(self, start: tuple[np.ndarray, np.ndarray, np.ndarray], rounds: int, good: np.ndarray | None = None
                 ) -> _Settled:  # fmt: skip
-        """Path and points adjusted to the tracks that follow them, good (n,) bool at first; all of them when None."""
+        """Path and points adjusted to the tracks that follow them, good (n,) bool at first; all of them when None.
+
+        Those follow that are not off by more than the best do, where enough of them are left in every frame.
+        """
         R, t, X = start
         X, sigma = X.copy(), 1.0
         good = np.ones(len(X), bool) if good is None else good
@@ -207,25 +213,30 @@ class _Rays:
             R, t, X[some], sigma = adjust(self.x[some], seen, R, t, X[some], self.focal, iterations=10, slip=slip)
             X = self.points(R, t, X)
             off = self.off(R, t, X)
-            good = (off < STRAY * max(sigma, LEAST_PX)) & (X[:, 2] > 0)
+            best = CORE_OF_NOISE * float(np.quantile(off[np.isfinite(off)], CORE))
+            for px in (min(best, sigma), sigma):
+                good = (off < STRAY * max(px, LEAST_PX)) & (X[:, 2] > 0)
+                if self.seen[good].sum(0).min() >= ENOUGH:
+                    break
             if good.sum() < LEAST:
                 break
         return _Settled((R, t, X), good, sigma)
 
 
-def at_rest(path: Path, paths: Paths, still: np.ndarray, focal: float) -> np.ndarray:
+def at_rest(path: Path, paths: Paths, still: np.ndarray, focal: float, missed: float = EXPLAINED) -> np.ndarray:
     """(k,) indices of the tracks that the path explains as points at rest.
 
     Args:
         paths: N tracks, px from the principal point, as filmed.
         still: (N, T, 2) the same in the compensated picture.  focal: px.
+        missed: share of what a track leaves its place by there that it may be off by, where that is more than noise.
     """
     rays = _Rays(paths, focal)
     X = rays.points(path.R, path.t)
     off, some = rays.off(path.R, path.t, X), paths.seen.any(1)
     left = np.zeros(len(paths))
     left[some] = np.nanmedian(np.linalg.norm(still[some] - np.nanmedian(still[some], axis=1)[:, None], axis=-1), axis=1)
-    explained = off < np.maximum(STRAY * max(path.sigma, LEAST_PX), EXPLAINED * left)
+    explained = off < np.maximum(STRAY * max(path.sigma, LEAST_PX), missed * left)
     return np.flatnonzero(explained & (X[:, 2] > _nearest(path.X)))
 
 
