@@ -25,7 +25,7 @@ from reconstruct.joint.finish import (
     finish,
 )
 from reconstruct.joint.groups import Rigid, two_bodies
-from reconstruct.joint.handheld import Path, at_rest, filmed, path_from_rest, scaled_to_link
+from reconstruct.joint.handheld import JOINS, Path, at_rest, filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.kinds import or_by_prior
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.parallels import along_edges
@@ -413,7 +413,7 @@ def _with_path(camera: _Camera, paths: Paths, warp: np.ndarray) -> _Camera:
             break
         # A part that the path explains by and by takes it over.
         path, before = further, rest
-        rest = np.union1d(keeps, at_rest(path, as_filmed, still.uv, camera.focal, missed=0.0))
+        rest = np.union1d(keeps, at_rest(path, as_filmed, still.uv, camera.focal, missed=JOINS))
         if np.array_equal(rest, before):
             break
     if path is None:

@@ -47,6 +47,8 @@ NEARER, EXPLAINED = 0.5, 0.1
 """Depth over that of the nearest of the scene from which on a track is taken for a point at rest, and the share of what
 it leaves its place by in the compensated picture that it may miss that point by. A part that goes straight for a few
 frames goes as some point does that is near enough to the camera."""
+JOINS = 0.05
+"""The same for a track that the path itself is held by from then on: a part that joins bends it, by and by to its own."""
 MIN_SEEN, ENOUGH = 5, 30
 """Points of the scene that every frame has to see, and that it should."""
 
