@@ -48,7 +48,7 @@ NEARER, EXPLAINED = 0.5, 0.1
 it leaves its place by in the compensated picture that it may miss that point by. A part that goes straight for a few
 frames goes as some point does that is near enough to the camera."""
 JOINS = 0.05
-"""The same for a track that the path itself is held by from then on: a part that joins bends it, by and by to its own."""
+"""The same for a track that the path itself is held by from then on: a part that joins bends it by and by."""
 MIN_SEEN, ENOUGH = 5, 30
 """Points of the scene that every frame has to see, and that it should."""
 
