@@ -215,7 +215,9 @@ class _Rays:
             R, t, X[some], sigma = adjust(self.x[some], seen, R, t, X[some], self.focal, iterations=10, slip=slip)
             X = self.points(R, t, X)
             off = self.off(R, t, X)
-            best = CORE_OF_NOISE * float(np.quantile(off[np.isfinite(off)], CORE))
+            if not (known := np.isfinite(off)).any():
+                return _Settled((R, t, X), known, sigma)
+            best = CORE_OF_NOISE * float(np.quantile(off[known], CORE))
             for px in (min(best, sigma), sigma):
                 good = (off < STRAY * max(px, LEAST_PX)) & (X[:, 2] > 0)
                 if self.seen[good].sum(0).min() >= ENOUGH:

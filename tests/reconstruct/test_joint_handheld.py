@@ -162,6 +162,13 @@ def test_what_is_off_by_more_than_noise_joins_no_path():
     assert np.isin(goes, exact).mean() < 0.2 and np.isin(np.r_[:80, 106:160], exact).mean() > 0.9
 
 
+def test_tracks_of_hardly_any_frame_tell_no_path():
+    tracks, warp, _, _ = scene()
+    flat = np.where(tracks.visible[..., None], tracks.uv, np.nan).astype(float)
+    flat[:, 3:] = np.nan
+    assert path_from_rest(Paths(filmed(flat, warp) - CENTRE), flat - CENTRE, np.arange(160), FOCAL) is None
+
+
 def test_a_part_that_hardly_moves_among_what_rests_bends_the_path_less(monkeypatch):
     """A door by 3 deg, more than a third of all tracks, which err slowly, each by its own size."""
 
