@@ -32,7 +32,8 @@ from reconstruct.joint.parallels import along_edges
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.plates import as_plate
-from reconstruct.joint.polish import Bundle, residuals
+from reconstruct.joint.polish import Bundle
+from reconstruct.joint.regions import least_missed, swept_by_regions
 from reconstruct.joint.result import FREELY, MIN_INLIERS, result_of, why_not_believed
 from reconstruct.joint.select import (
     distinct,
@@ -48,7 +49,7 @@ from reconstruct.joint.select import (
     worth,
 )
 from reconstruct.joint.slight import slight_motion
-from reconstruct.joint.sweep import SMALL, Swept, placed_on, sweep
+from reconstruct.joint.sweep import EXACT_PX, SMALL, Swept, placed_on, sweep
 from reconstruct.video import Video
 
 MOVING_SHARE = 0.012
@@ -63,13 +64,16 @@ STROKE_STDS = 8.0
 """Stroke over its standard deviation up to which two groups of tracks before a moving camera are one body."""
 DEPTHS_OF_LINK = np.exp(-np.linspace(np.log(0.7), np.log(2.8), 5))
 """Of a link before a hand-held camera over the scene's, that are tried."""
-MISSED_PX = 0.3
-"""What a track costs at most by which joints of two sweeps are compared."""
+EXACT = 1.2
+"""Noise over the least that is believed, up to which a sweep's joint leaves nothing to look for."""
+MOST = 0.5
+"""Of the tracks of a region, the share by which a joint of it alone has to be followed before a resting camera."""
 NO_LINK = "no joint: the points of the tracks that agree with the best one are those of no one body"
 NO_STROKE = "nothing moves: the rigid groups of tracks stand still against each other"
 APART = "the camera moves, and hardly any frame shows the scene and the part together"
 NO_SCENE = "the camera moves, and too few points of a static scene are followed"
 NO_SLIDE = "a slide is more probable, but its points would move as a free body, those of the hinge do not"
+BESIDE = "what moves beside it, its shadow maybe, follows it but roughly"
 STRAYS = "most of what leaves its place does not follow it"
 ANY_DEG = float(np.degrees(np.sqrt(np.pi - 2)))
 """Root of the mean square angle between an axis and one at random. Three such answers from pixels were 50 deg and more
@@ -311,12 +315,22 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
             reason = why_not_believed(done, restless)
     except NoLink:
         return refused(NO_LINK, found.members)
-    if reason:
-        return refused(reason, done.members, done.bundle.sigma)
-    if video.warp is None:
-        done, note = _better_held(done, pictures, note)
-    full = camera.focal / video.scale
-    fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
+
+    def fit_of(done: Finished, note: str) -> JointFit:
+        if video.warp is None:
+            done, note = _better_held(done, pictures, note)
+        return result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
+
+    fit = None if reason else fit_of(done, note)
+    doubted = fit is None or fit.verdict != "ok"
+    if video.warp is None and doubted and regions == 1 and not _is_small(found, camera):
+        other = _of_a_region(found, paths - camera.centre, view, done.bundle.sigma)
+        if other is not None and not why_not_believed(other, restless):
+            beside = fit_of(other, f"{note}; {BESIDE}")
+            if beside.verdict == "ok":
+                return _Draw(beside, found.explained, other.bundle.sigma, other)
+    if fit is None:
+        return refused(reason or "", done.members, done.bundle.sigma)
     if no_slide:
         fit = doubtful(fit, NO_SLIDE)
     return _Draw(fit, found.explained, done.bundle.sigma, done)
@@ -340,8 +354,9 @@ def _is_small(found: _Consensus, camera: _Camera) -> bool:
 
 
 def _swept_before_path(found: _Consensus, paths: Paths, view: View, depth: float, small: bool) -> Swept | None:
-    """The better joint of two sweeps, from the search's tracks and from all that leaves its place: in the compensated
-    picture what is near the camera goes as its parallax does, and the search may have found that.
+    """The best joint of several sweeps, from the search's tracks and from all that leaves its place: in the compensated
+    picture what is near the camera goes as its parallax does, and the search may have found that. Where neither is as
+    exact as tracks are, from those of regions: beside shadows that go as it goes a part is a small share of all.
 
     Args:
         paths: all tracks, px from the principal point, as filmed.  view: with the camera's path.
@@ -354,24 +369,38 @@ def _swept_before_path(found: _Consensus, paths: Paths, view: View, depth: float
     if found.obs is None:
         return None
     rivals = found.bundles(found.obs)
-    every = view.sightings(paths[found.moving], np.arange(paths.uv.shape[1]))
-
-    def missed(swept: Swept) -> float:
-        """px, of all that leaves its place, MISSED_PX a track at most."""
-        b = placed_on(next(iter(swept.starts.values()))[0], every)
-        off = np.where(every.seen, np.linalg.norm(residuals(b, every), axis=-1), np.nan)
-        return float(np.sum(np.minimum(np.nanmedian(off[every.seen.any(1)], axis=1), MISSED_PX)))
-
-    tries = [
-        sweep(paths, found.moving, found.obs, pool, rivals, view, DEPTHS_OF_LINK * depth)
-        for pool in (found.members, found.moving)
-    ]
-    best = min((swept for swept in tries if swept is not None), key=missed, default=None)
+    depths = DEPTHS_OF_LINK * depth
+    pools = (found.members, found.moving)
+    several = [sweep(paths, found.moving, found.obs, pool, rivals, view, depths) for pool in pools]
+    tries = [swept for swept in several if swept is not None]
+    if not any(swept.lead.sigma < EXACT * EXACT_PX for swept in tries):
+        tries += swept_by_regions(paths, found.moving, found.obs, view, rivals, depths)
+    best = least_missed(tries, paths, found.moving, view)
     if best is None or small:
         return best
-    lead = next(iter(best.starts.values()))[0]
+    lead = best.lead
     same = any(b.kind == lead.kind and apart_deg(b, lead) < APART_DEG for b in rivals)
     return None if same else best
+
+
+def _of_a_region(found: _Consensus, paths: Paths, view: View, than: float) -> Finished | None:
+    """The joint before a resting camera that most tracks of one region of the picture follow, SHARPER than those of
+    another that is in doubt, whose noise is ``than`` px; or None. paths: of all tracks, px from the principal point.
+
+    Beside its shadow a part is a small share of what moves, and no joint follows both but in pixels.
+    """
+    if found.obs is None:
+        return None
+    exact = max(than / SHARPER, EXACT * EXACT_PX)
+    tries = swept_by_regions(paths, found.moving, found.obs, view)
+    tries = [swept for swept in tries if swept.share > MOST and swept.lead.sigma < exact]
+    if (best := least_missed(tries, paths, found.moving, view)) is None:
+        return None
+    try:
+        done = finish(best.starts, paths, best.ids, view)
+    except NoLink:
+        return None
+    return done if SHARPER * done.bundle.sigma < than else None
 
 
 def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, camera: _Camera
@@ -395,7 +424,7 @@ def _hand_held(found: _Consensus, paths: Paths, warp: np.ndarray, view: View, ca
     starts, members = found.starts, found.members
     depth = float(np.median(scene.X[:, 2]))
     if (swept := _swept_before_path(found, as_filmed, view, depth, _is_small(found, camera))) is not None:
-        unit = float(np.median(next(iter(swept.starts.values()))[0].X[:, 2]))
+        unit = float(np.median(swept.lead.X[:, 2]))
         starts = {kind: [b.scaled(1 / unit) for b in several] for kind, several in swept.starts.items()}
         view, scene, members = replace(view, t=view.t / unit), replace(scene, X=scene.X / unit), swept.ids
     done = finish(starts, as_filmed, members, view, scene)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
 from reconstruct.joint.groups import farthest, neighbours, paths_of_patch
 from reconstruct.joint.hypotheses import Hypothesis, prismatic_hypotheses, revolute_hypotheses
 from reconstruct.joint.paths import Paths, held
+from reconstruct.joint.regions import region_of
 
 SCORE_PX = 3.0
 """Scale of the robust score, working px."""
@@ -448,18 +447,13 @@ def search_regions(obs: Observations, rng: np.random.Generator, count: int) -> l
 
     Args:
         obs: key-frame observations of N moving tracks.  rng: of the searches.
-        count: of regions (k-means of the tracks' median places, from a row along the direction that they extend in).
+        count: of regions, by the tracks' median places.
 
     Returns:
         States with the depths of all N tracks.
     """
     place = np.array([np.median(obs.xy[i, obs.seen[i]], axis=0) for i in range(len(obs.ref))])
-    off = place - place.mean(0)
-    order = np.argsort(off @ np.linalg.svd(off, full_matrices=False)[2][0])
-    first = place[order[((np.arange(count) + 0.5) / count * len(place)).astype(int)]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a region that has lost its tracks is not searched
-        region = kmeans2(place, first, minit="matrix")[1]
+    region = region_of(place, count)
     out: list[State] = []
     for k in range(count):
         here = region == k

@@ -58,7 +58,9 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     agrees; a sure answer counts that its tracks follow no less exactly, unless it confirms the joint and knows the axis
     no better. It is asked so as well where much of the joint was on edges and some of what is left may be; any sure
     answer that contradicts it makes the joint doubtful. What counts is doubtful too where a sure one with all
-    contradicts it beside a doubtful one. In a grey world only many edges are asked of.
+    contradicts it beside a doubtful one. Where more of the tracks off the edges follow the first joint, and no less
+    exactly, than another that is found among these, the more exact one counts and is doubtful. In a grey world only
+    many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous; of these two the second, and a sure one in its place, where one of the same type is found
@@ -88,6 +90,8 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if again.verdict == "refused":
         ask_lit = lambda: ask(without(tracks, maybe_shadows(video, tracks)))  # noqa: E731
         return fit if refused else _nothing_without(fit, cast, ask_lit)
+    if many and _outnumbered(again, fit, int(np.sum(~cast))):
+        return _most_exact(fit, again, again)
     may = maybe_shadows(video, tracks)
     share = 0.0 if _grey(tracks) else float(np.mean(may[again.point_track]))
     asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
@@ -158,6 +162,14 @@ def _sharper(joint: JointFit, than: JointFit, times: float = 1.0) -> bool:
     """Whether a joint is sure, and its tracks miss it so many times less."""
     after, before = joint.residual_px, than.residual_px
     return joint.verdict == "ok" and after is not None and before is not None and times * after <= before
+
+
+def _outnumbered(other: JointFit, joint: JointFit, left: int) -> bool:
+    """Whether another joint, found without some tracks of a sure one, contradicts it though more of the tracks that it
+    was looked for among follow that, left of them, and no less exactly."""
+    if joint.verdict != "ok" or not contradicts(other, joint) or left <= other.inliers:
+        return False
+    return bool(np.nan_to_num(joint.residual_px, nan=np.inf) <= np.nan_to_num(other.residual_px, nan=np.inf))
 
 
 def _confirms(other: JointFit, joint: JointFit) -> bool:

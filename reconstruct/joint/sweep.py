@@ -48,10 +48,17 @@ class Swept:
     Attributes:
         starts: per type, the best joint of the tracks `ids` in all frames, and others that cost little more.
         ids: (n,) tracks that follow the best one within their noise.
+        share: of the tracks that were swept, that are among these.
     """
 
     starts: dict[str, list[Bundle]]
     ids: np.ndarray
+    share: float
+
+    @property
+    def lead(self) -> Bundle:
+        """The best one."""
+        return next(iter(self.starts.values()))[0]
 
 
 def sweep(
@@ -107,7 +114,7 @@ def sweep(
         if not first or (b.cost < RIVAL * found[0].cost and len(first) < RIVALS):
             # Every joint has its own points: those of another would lead it into that one's optimum.
             first.append(states_of_all_frames(placed_on(b, sight), every, keys))
-    return Swept(starts, pool)
+    return Swept(starts, pool, float(np.isin(members, pool).mean()))
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,40 @@ def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, t
     return tracks, warp, (R, t), q
 
 
+def beside_its_shadow(count, held, seed=0):
+    """The door of `scene` beside so many more tracks on the wall, where a lamp throws the shadow of its points.
+
+    Returns:
+        The video of a camera in a hand, or of one at rest, and the tracks; the door's are 160 to 204.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if not held:
+            patch.setitem(globals(), "camera_path", lambda T, _: (np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, 3))))
+        tracks, warp, (R, t), q = scene(noise=0.05, seed=seed)
+    rng, lamp = np.random.default_rng(seed + 7), np.array([-1.0, -0.6, -0.3])
+    door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (count, 3))
+    pose = joint_transform("revolute", AXIS, POINT, -q)
+    ray = np.einsum("tij,nj->nti", pose[:, :3, :3], door) + pose[:, :3, 3] - lamp
+    shadow = lamp + ray * (2.2 - lamp[2]) / ray[..., 2:]
+    uv = project(np.einsum("tij,ntj->nti", R, shadow) + t) + rng.normal(0, 0.05, (count, FRAMES, 2))
+    flat = np.stack([cv2.perspectiveTransform(uv[None, :, k].copy(), warp[k])[0] for k in range(FRAMES)], axis=1)
+    visible = np.concatenate([tracks.visible, ((uv > 0) & (uv < [W, H])).all(-1)])
+    uv = np.concatenate([tracks.uv, flat.astype(np.float32)])
+    both = replace(tracks, uv=uv, visible=visible, reference=np.zeros(len(uv), int))
+    return replace(make_video(FRAMES), warp=warp if held else None), both
+
+
+@pytest.mark.parametrize(("held", "count"), [(True, 250), (False, 120)])
+def test_a_door_is_found_beside_its_shadow_that_has_more_tracks(held, count):
+    """Nothing says which are the shadow's: these follow a hinge to a quarter of a pixel, the door's to their noise."""
+    video, tracks = beside_its_shadow(count, held)
+    fit = fit_joint(video, tracks, FOCAL, camera_moving=False)
+    assert fit.type == "revolute" and fit.verdict == "ok", fit.reason
+    assert held or "beside it" in fit.reason
+    assert np.isin(fit.point_track, np.arange(160, 205)).mean() > 0.95
+    assert angle(fit) < 0.3
+
+
 def angle(fit):
     a = fit.T_camera_world[:3, :3] @ fit.axis
     return np.degrees(np.arccos(min(1.0, abs(a @ AXIS))))

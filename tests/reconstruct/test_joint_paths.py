@@ -305,6 +305,22 @@ def test_two_sure_joints_with_and_without_shadows_that_contradict_each_other_are
     assert (fit.verdict, fit.residual_px) == (verdict, px)
 
 
+@pytest.mark.parametrize(("px", "count", "expected"), [
+    (0.05, 20, ("ambiguous", 0.03)),  # forty-five of the tracks off the edges follow the first, and more exactly
+    (0.02, 20, ("ok", 0.02)),
+    (0.05, 60, ("ok", 0.05)),
+])  # fmt: skip
+def test_a_joint_off_some_shadows_that_fewer_tracks_follow_does_not_take_the_place_of_one(px, count, expected):
+    """Half of the tracks on a blade's edges count as a shadow's: without them a hinge 70 deg off was sure of 16."""
+    scene = make_scene("revolute", [0, 1, 0.1], [-0.3, 0, 1.5], [[0.05, 0.5], [-0.3, 0.3], [-0.05, 0.05]], 0.8,
+                       points=150)  # fmt: skip
+    number = np.arange(len(scene.tracks.uv))
+    tracks = replace(scene.tracks, cast=number < 40, shade=np.zeros(len(number), bool))
+    again = made("ok", 70.0, px, number[100 : 100 + count], 2.0)
+    fit = unless_a_shadow(made("ok", 0.0, 0.03, number[:85], 2.0), scene.video, tracks, lambda _: again)
+    assert (fit.verdict, fit.residual_px) == expected
+
+
 @pytest.mark.parametrize(("verdict", "px", "expected"), [
     ("ok", 0.05, ("ambiguous", 0.05)),  # sure and more exact: its axis counts
     ("ok", 0.2, ("ambiguous", 0.1)),
