@@ -36,6 +36,15 @@ def camera_path(frames, rng):
     return R, -np.einsum("tij,tj->ti", R, sway[:, :3])
 
 
+def poses(body, q):
+    """(T, 4, 4) of a door on its hinge at these angles, or of one that is carried away."""
+    if body == "hinge":
+        return joint_transform("revolute", AXIS, POINT, -q)
+    pose = joint_transform("revolute", AXIS, POINT, -0.5 * q)
+    pose[:, :3, 3] += np.column_stack([0.1 * q, -0.15 * np.sin(2.5 * q), 0.1 * q**2])
+    return pose
+
+
 def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, turn=0.9, slant=(0.0, 0.0)):
     """Tracks of a door before a desk and a wall, in the picture that the wall's homographies take to its first view.
 
@@ -50,11 +59,7 @@ def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, t
     door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (link, 3))
     s = np.clip((np.arange(FRAMES) - 6) / (FRAMES - 12), 0, 1)
     q = turn * (3 * s**2 - 2 * s**3)
-    if body == "hinge":
-        pose = joint_transform("revolute", AXIS, POINT, -q)
-    else:  # carried away on a curve
-        pose = joint_transform("revolute", AXIS, POINT, -0.5 * q)
-        pose[:, :3, 3] += np.column_stack([0.1 * q, -0.15 * np.sin(2.5 * q), 0.1 * q**2])
+    pose = poses(body, q)
     moving = np.einsum("tij,nj->nti", pose[:, :3, :3], door) + pose[:, :3, 3]
     world = np.concatenate([np.repeat(still[:, None], FRAMES, axis=1), moving])
     uv = project(np.einsum("tij,ntj->nti", R, world) + t)
@@ -67,7 +72,7 @@ def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, t
     return tracks, warp, (R, t), q
 
 
-def beside_its_shadow(count, held, seed=0):
+def beside_its_shadow(count, held, body="hinge", seed=0):
     """The door of `scene` beside so many more tracks on the wall, where a lamp throws the shadow of its points.
 
     Returns:
@@ -76,10 +81,10 @@ def beside_its_shadow(count, held, seed=0):
     with pytest.MonkeyPatch.context() as patch:
         if not held:
             patch.setitem(globals(), "camera_path", lambda T, _: (np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, 3))))
-        tracks, warp, (R, t), q = scene(noise=0.05, seed=seed)
+        tracks, warp, (R, t), q = scene(noise=0.05, body=body, seed=seed)
     rng, lamp = np.random.default_rng(seed + 7), np.array([-1.0, -0.6, -0.3])
     door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (count, 3))
-    pose = joint_transform("revolute", AXIS, POINT, -q)
+    pose = poses(body, q)
     ray = np.einsum("tij,nj->nti", pose[:, :3, :3], door) + pose[:, :3, 3] - lamp
     shadow = lamp + ray * (2.2 - lamp[2]) / ray[..., 2:]
     uv = project(np.einsum("tij,ntj->nti", R, shadow) + t) + rng.normal(0, 0.05, (count, FRAMES, 2))
@@ -99,6 +104,11 @@ def test_a_door_is_found_beside_its_shadow_that_has_more_tracks(held, count):
     assert held or "beside it" in fit.reason
     assert np.isin(fit.point_track, np.arange(160, 205)).mean() > 0.95
     assert angle(fit) < 0.3
+
+
+def test_a_door_that_is_carried_away_beside_its_shadow_is_refused():
+    video, tracks = beside_its_shadow(120, held=False, body="carried")
+    assert fit_joint(video, tracks, FOCAL, camera_moving=False).verdict == "refused"
 
 
 def angle(fit):
