@@ -316,24 +316,21 @@ def _one_draw(video: Video, paths: Paths, camera: _Camera, view: View, known: fl
     except NoLink:
         return refused(NO_LINK, found.members)
 
-    def fit_of(done: Finished, note: str) -> JointFit:
+    def answer(done: Finished, note: str) -> _Draw:
         if video.warp is None:
             done, note = _better_held(done, pictures, note)
-        return result_of(video, done, camera.focal / video.scale, len(paths), note, KNOWN_STD if known else None)
+        full = camera.focal / video.scale
+        fit = result_of(video, done, full, len(paths), note, KNOWN_STD if known else None)
+        return _Draw(fit, found.explained, done.bundle.sigma, done)
 
-    fit = None if reason else fit_of(done, note)
-    doubted = fit is None or fit.verdict != "ok"
-    if video.warp is None and doubted and regions == 1 and not _is_small(found, camera):
+    draw = refused(reason, done.members, done.bundle.sigma) if reason else answer(done, note)
+    if video.warp is None and draw.fit.verdict != "ok" and regions == 1 and not _is_small(found, camera):
         other = _of_a_region(found, paths - camera.centre, view, done.bundle.sigma)
         if other is not None and not why_not_believed(other, restless):
-            beside = fit_of(other, f"{note}; {BESIDE}")
-            if beside.verdict == "ok":
-                return _Draw(beside, found.explained, other.bundle.sigma, other)
-    if fit is None:
-        return refused(reason or "", done.members, done.bundle.sigma)
-    if no_slide:
-        fit = doubtful(fit, NO_SLIDE)
-    return _Draw(fit, found.explained, done.bundle.sigma, done)
+            beside = answer(other, f"{note}; {BESIDE}")
+            if beside.fit.verdict == "ok":
+                return beside
+    return replace(draw, fit=doubtful(draw.fit, NO_SLIDE)) if no_slide else draw
 
 
 def _sharpened(found: _Consensus, paths: Paths, view: View, camera: _Camera) -> tuple[Starts, np.ndarray]:

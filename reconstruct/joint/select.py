@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.bundle import Observations, State, refine, reprojection, solve_depths, transport
 from reconstruct.joint.groups import farthest, neighbours, paths_of_patch
 from reconstruct.joint.hypotheses import Hypothesis, prismatic_hypotheses, revolute_hypotheses
 from reconstruct.joint.paths import Paths, held
-from reconstruct.joint.regions import region_of
 
 SCORE_PX = 3.0
 """Scale of the robust score, working px."""
@@ -436,6 +437,17 @@ def search(
     out = first + _best_of(hyps, obs, coarse, fine, thorough=True, more=more)
     progress(1.0)
     return sorted(out, key=lambda s: -worth(s, obs))
+
+
+def region_of(place: np.ndarray, count: int) -> np.ndarray:
+    """(N,) region of the picture, of so many, that each of the places (N, 2) lies in: k-means from a row along the
+    direction that they extend in."""
+    off = place - place.mean(0)
+    order = np.argsort(off @ np.linalg.svd(off, full_matrices=False)[2][0])
+    first = place[order[((np.arange(count) + 0.5) / count * len(place)).astype(int)]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a region may lose all its tracks
+        return kmeans2(place, first, minit="matrix")[1]
 
 
 def search_regions(obs: Observations, rng: np.random.Generator, count: int) -> list[State]:

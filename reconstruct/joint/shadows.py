@@ -90,7 +90,7 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     if again.verdict == "refused":
         ask_lit = lambda: ask(without(tracks, maybe_shadows(video, tracks)))  # noqa: E731
         return fit if refused else _nothing_without(fit, cast, ask_lit)
-    if many and _outnumbered(again, fit, int(np.sum(~cast))):
+    if many and np.sum(~cast) > again.inliers and _sharper(fit, again) and contradicts(again, fit):
         return _most_exact(fit, again, again)
     may = maybe_shadows(video, tracks)
     share = 0.0 if _grey(tracks) else float(np.mean(may[again.point_track]))
@@ -162,14 +162,6 @@ def _sharper(joint: JointFit, than: JointFit, times: float = 1.0) -> bool:
     """Whether a joint is sure, and its tracks miss it so many times less."""
     after, before = joint.residual_px, than.residual_px
     return joint.verdict == "ok" and after is not None and before is not None and times * after <= before
-
-
-def _outnumbered(other: JointFit, joint: JointFit, left: int) -> bool:
-    """Whether another joint, found without some tracks of a sure one, contradicts it though more of the tracks that it
-    was looked for among follow that, left of them, and no less exactly."""
-    if joint.verdict != "ok" or not contradicts(other, joint) or left <= other.inliers:
-        return False
-    return bool(np.nan_to_num(joint.residual_px, nan=np.inf) <= np.nan_to_num(other.residual_px, nan=np.inf))
 
 
 def _confirms(other: JointFit, joint: JointFit) -> bool:

@@ -45,12 +45,13 @@ def poses(body, q):
     return pose
 
 
-def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, turn=0.9, slant=(0.0, 0.0)):
+def scene(noise=0.1, rest=160, link=45, body="hinge", link_noise=None, seed=0, turn=0.9, slant=(0.0, 0.0),
+          held=True):  # fmt: skip
     """Tracks of a door before a desk and a wall, in the picture that the wall's homographies take to its first view.
 
-    turn: of the door, rad.  slant: of the wall, depth over what is beside and above."""
+    turn: of the door, rad.  slant: of the wall, depth over what is beside and above.  held: else the camera rests."""
     rng = np.random.default_rng(seed)
-    R, t = camera_path(FRAMES, rng)
+    R, t = camera_path(FRAMES, rng) if held else (np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3)))
     half = rest // 2
     wall = np.column_stack([rng.uniform(-1.2, 1.2, half), rng.uniform(-0.7, 0.5, half), np.full(half, 2.2)])
     wall[:, 2] += wall[:, :2] @ slant
@@ -78,10 +79,7 @@ def beside_its_shadow(count, held, body="hinge", seed=0):
     Returns:
         The video of a camera in a hand, or of one at rest, and the tracks; the door's are 160 to 204.
     """
-    with pytest.MonkeyPatch.context() as patch:
-        if not held:
-            patch.setitem(globals(), "camera_path", lambda T, _: (np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, 3))))
-        tracks, warp, (R, t), q = scene(noise=0.05, body=body, seed=seed)
+    tracks, warp, (R, t), q = scene(noise=0.05, body=body, seed=seed, held=held)
     rng, lamp = np.random.default_rng(seed + 7), np.array([-1.0, -0.6, -0.3])
     door = POINT + rng.uniform([0.02, -0.2, -0.02], [0.3, 0.2, 0.0], (count, 3))
     pose = poses(body, q)
