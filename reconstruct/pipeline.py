@@ -339,7 +339,7 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
         margin_px: how far off hands pictures are looked at, as of :func:`lk_tracks.pictures_of`; as usual when None.
     """
     from reconstruct.hand.forearm import on_forearm
-    from reconstruct.joint.answers import open_states_told
+    from reconstruct.joint.answers import open_states_told, type_no_surer
     from reconstruct.joint.edges import unless_one_edge
     from reconstruct.joint.fit import fit_joint, moving_tracks
     from reconstruct.joint.flat_fit import FlatFit, fit_flat
@@ -383,10 +383,10 @@ def joint_off_the_arm(video: Video, tracks: Tracks, hands: Hands, focal: float |
     if fit.verdict == "refused" and share >= ARM_SHARE:
         again = unless_one_edge(off_shadows_too(tracks), video, tracks, off_shadows_too)
         if again.verdict != "refused" and np.mean(arm[again.point_track]) < 0.5:
-            return open_states_told(again)
+            return type_no_surer(open_states_told(again))
     fit = unless_carried(fit, video, rest, hands, off_shadows_too)
     fit = unless_rims_tell(fit, video, rest, rims, ask, flat)
-    fit = open_states_told(with_unseen_states(fit, video, pictures, rest, rims, lines))
+    fit = type_no_surer(open_states_told(with_unseen_states(fit, video, pictures, rest, rims, lines)))
     # No semicolon: what follows one is advice.
     return replace(fit, reason=f"without what is on an arm, {fit.reason}") if share >= ARM_SHARE else fit
 

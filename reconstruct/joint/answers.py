@@ -15,6 +15,8 @@ AS_WELL = 1.5
 """Ratio of what two joints state of their axes up to which these are known alike."""
 WHOLE = 0.99
 """A state that is stated to such a share of the stroke is not known at all."""
+OPEN_DEG = 20.0
+"""An axis known to a third of a radian or worse: a hinge's curvature is within three standard deviations of none."""
 FACTOR = 2.0
 """How many times what is stated joints are off that are taken for want of a better one (the root of the mean square of
 nine rendered ones by straight edges, 0.1 to 3.6; 1.2 of fourteen by points up to hands' rims, 0.02 to 3.1)."""
@@ -77,6 +79,17 @@ def open_states_told(fit: JointFit) -> JointFit:
         return fit
     words = f"in {count} of {len(fit.q)} frames nothing holds the state to the first one's: the range may be another"
     return replace(fit, reason=f"{fit.reason}; {words}")
+
+
+def type_no_surer(fit: JointFit) -> JointFit:
+    """The joint; where its axis is stated to OPEN_DEG or worse, its type no surer than one half and half of the prior:
+    what holds the axis no better tells the types apart no better."""
+    if fit.verdict != "ambiguous" or fit.std.get("axis_deg", 0.0) <= OPEN_DEG:
+        return fit
+    most = or_by_prior({kind: float(kind == fit.type) for kind in fit.type_probability})
+    if fit.type_probability.get(fit.type, 0.0) <= most.get(fit.type, 1.0):
+        return fit
+    return replace(fit, type_probability=most)
 
 
 def doubtful(fit: JointFit, words: str) -> JointFit:

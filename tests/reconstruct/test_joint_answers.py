@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruct.joint.answers import open_states_told
+from reconstruct.joint.answers import OPEN_DEG, open_states_told, type_no_surer
 from reconstruct.joint.models import JointFit
 from tests.reconstruct.joint_scenes import made
 
@@ -33,3 +33,19 @@ def test_a_refusal_and_states_that_are_badly_known_are_left_alone():
     assert open_states_told(refused) is refused
     vague = door(np.full(40, 0.5 * STROKE))
     assert open_states_told(vague) is vague
+
+
+@pytest.mark.parametrize(("axis_deg", "p", "stated"), [(9, 0.99, 0.99), (OPEN_DEG + 1, 0.99, 0.69), (247, 0.5, 0.5)])
+def test_a_type_is_no_surer_than_its_axis_is_known(axis_deg, p, stated):
+    fit = made("ambiguous", 0.0, 0.1, np.arange(30), axis_deg)
+    slide = replace(fit, type="prismatic", point=None, type_probability={"prismatic": p, "revolute": 1 - p})
+    told = type_no_surer(slide)
+    assert told.type_probability["prismatic"] == pytest.approx(stated, abs=0.01)
+    assert sum(told.type_probability.values()) == pytest.approx(1.0)
+    assert told.axis is slide.axis and told.verdict == "ambiguous"
+
+
+def test_what_is_sure_or_refused_keeps_its_type():
+    sure, refused = made("ok", 0.0, 0.1, np.arange(30), 30.0), JointFit("refused", "nothing moves")
+    assert type_no_surer(sure) is sure
+    assert type_no_surer(refused) is refused
