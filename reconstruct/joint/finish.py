@@ -6,14 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
-from scipy.special import expit
 
 from reconstruct.joint.bundle import Observations, State, transport
 from reconstruct.joint.cameras import before_the_link, smoother_before_the_link
-from reconstruct.joint.groups import triangulated
 from reconstruct.joint.halves import halves, widened
-from reconstruct.joint.kinds import log_odds_hinge, log_odds_screw, majority, probabilities, tempered, votes
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import (
     HOLDERS,
@@ -27,7 +23,6 @@ from reconstruct.joint.polish import (
     radius_cost,
     residuals,
     robust_loss,
-    track_costs,
 )
 from reconstruct.joint.states import held_only, in_sight_only
 from reconstruct.joint.twist import Twist, twist_of_joint
@@ -41,6 +36,8 @@ from reconstruct.joint.uncertainty import (
     spread,
     strayed,
 )
+from reconstruct.joint.view import Still, View
+from reconstruct.joint.weigh import Rival, strongest_rival, turn_deg, type_probabilities
 
 MIN_COMMON = 8
 FLEX_PX, FLEX_SIGMAS = 1.0, 4.0
@@ -54,47 +51,15 @@ FREE_FRAMES, MOST_STILL = 100, 200
 """The same where the camera's poses are unknown: six more numbers a frame make a step dear."""
 COARSE_FRAMES = 40
 """Frames of the first round before a moving camera, which finds every type's best joint."""
-SCREW_TURN_DEG, FREE_BODY = 120.0, 0.95
-"""Between two poses every rigid motion is a screw (Chasles): only a long one is evidence for a thread. A shorter one is
-no type among the others; it stands for a body that moves freely, if it is clearly more probable than they are."""
-VOTERS = 0.15
-"""Edge of a neighbourhood that has a vote on the type, over the link's diagonal."""
-FEW_SPEAK, BENT_DEG = (3.0, 2.0), 10.0
-"""Votes for a hinge, and neighbourhoods whose middle track is for it, in standard deviations: below both it is a few
-tracks that speak for it, however much each of them gains; and the turn up to which strays bend a slide."""
-SHAPELY = 0.95
-"""Share of a link's points that are near each other: of 11 right joints of small motions all of them, of a wrong slide
-0.86."""
-UNDECIDED = 1.0
-"""Log odds that are left where points out of all proportion to the link would turn the answer round, or the votes."""
 NEAR, HELD = 4.0, 30.0
 """A hinge is as near as hinges are if the logarithm of its radius is within two standard deviations of the prior; and
 how much more than it is worth the prior counts to get there."""
-SPANS, NOISY_PX = 4, 0.2
-"""Spans of a camera's path that are independent of each other, and px, of a point at the link's depth, up to which a
-step is none."""
-APART_DEG = 8.0
-"""Axes so far from each other are two optima, not one."""
 NO_SCREW = 1e-3
 """A thread less probable than this in the first round is not looked at again: the hinge is its special case."""
 
 
 class NoLink(Exception):
     """The points of the tracks are no one body by any type: too few are before the camera and near each other."""
-
-
-LIKELY = 0.1
-"""Probability of another axis, or type, from which on the answer is not called certain."""
-
-
-@dataclass(frozen=True)
-class Rival:
-    """Another joint of the same type that explains the motion too, with states in all frames, how far off its axis is,
-    and how probable it is."""
-
-    apart_deg: float
-    probability: float
-    joint: Bundle
 
 
 @dataclass(frozen=True)
@@ -134,42 +99,6 @@ class Finished:
         return float(np.hypot(self.spread.axis_deg, np.sqrt(self.rival.probability) * self.rival.apart_deg))
 
 
-@dataclass(frozen=True)
-class Still:
-    """The resting scene before a moving camera.
-
-    Attributes:
-        ids: (m,) its tracks.  X: (m, 3) their points in the world.
-        known: whether it is known that these rest; else the smoother path of the camera decides.
-        sigma: noise of one coordinate, px; like the link's when None. Real links flex, blur and are cast into shade: a
-            path that is held no better than the link bends after it.
-    """
-
-    ids: np.ndarray
-    X: np.ndarray
-    known: bool = False
-    sigma: float | None = None
-
-    def before(self, view: View, paths: Paths, log_focal: float) -> Still:
-        """The scene with the points that a path gives it: one that was fitted has a scale of its own.
-
-        Args:
-            paths: of all tracks.  log_focal: correction of the focal length's logarithm that goes with the path.
-        """
-        assert view.R is not None and view.t is not None
-        uv = paths.uv[self.ids]
-        x, seen = uv / (view.focal * np.exp(log_focal)), np.isfinite(uv[..., 0])
-        slip = None if paths.slip is None else paths.slip[self.ids]
-        rough = triangulated(x, seen, view.R, view.t, slip=slip)
-        X = triangulated(x, seen, view.R, view.t, rough, slip=slip)
-        # What the path hardly passes goes to the others' depth.
-        good = X[:, 2] > 0
-        first = seen.argmax(1)
-        there = np.concatenate([x[np.arange(len(x)), first], np.ones((len(x), 1))], axis=1) * np.median(X[good, 2])
-        there = np.einsum("nji,nj->ni", view.R[first], there - view.t[first])
-        return replace(self, X=np.where(good[:, None], X, there))
-
-
 def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
     """A key-frame state as a start for all frames, with the link's median depth as the unit.
 
@@ -191,61 +120,6 @@ def bundle_of_state(s: State, obs: Observations, frames: np.ndarray) -> Bundle:
     point = s.point / unit
     twist, speed = twist_of_joint(s.kind, s.axis, point, anchor_of(s.kind, X, s.axis, point))
     return Bundle(s.kind, twist, q * speed, X)
-
-
-@dataclass(frozen=True)
-class View:
-    """How the tracks were seen.
-
-    Attributes:
-        focal: px.  focal_std: of its logarithm, 0 where it is known.
-        R, t: (T, 3, 3), (T, 3) world to camera; None for a static camera.
-        restless: px by which points at rest leave their place before a camera that was made static; 0 where it was.
-    """
-
-    focal: float
-    focal_std: float = 0.0
-    R: np.ndarray | None = None
-    t: np.ndarray | None = None
-    restless: float = 0.0
-
-    def sightings(self, paths: Paths, frames: np.ndarray, lasting: float = 1.0) -> Sightings:
-        """Of tracks in some frames."""
-        some = paths.at(frames)
-        seen = some.seen
-        R, t = (None, None) if self.R is None else (self.R[frames], self.t[frames])
-        return Sightings(np.where(seen[..., None], some.uv, 0.0), seen, np.ones(len(some)), self.focal, self.focal_std,
-                         R, t, frames, lasting, slip=some.slip)  # fmt: skip
-
-    def before(self, s: Sightings) -> Sightings:
-        """The same sightings before this path."""
-        assert s.frames is not None
-        return s if self.R is None else replace(s, R=self.R[s.frames], t=self.t[s.frames])
-
-    def at_first(self, paths: Paths, depth: float) -> Paths:
-        """Tracks as a camera that stays in the first one's place would see them, if all were at one depth before the
-        camera that did; themselves where that rests.
-
-        Args:
-            paths: N tracks in T frames, px from the principal point.  depth: in the unit of t.
-        """
-        if self.R is None or self.t is None:
-            return paths
-        x = np.concatenate([paths.uv / self.focal, np.ones((*paths.uv.shape[:2], 1))], axis=-1) * depth
-        x = np.einsum("tji,ntj->nti", self.R, x - self.t)
-        return replace(paths, uv=self.focal * x[..., :2] / np.maximum(x[..., 2:], 1e-3))
-
-    def corrected(self, b: Bundle, some: np.ndarray) -> View:
-        """The camera's path as a bundle adjustment of some frames found it, interpolated between them."""
-        assert self.R is not None and self.t is not None and b.R is not None and b.t is not None
-        every = np.arange(len(self.R))
-        turn = Rotation.from_matrix(b.R @ np.swapaxes(self.R[some], 1, 2))
-        R = Slerp(some, turn)(every).as_matrix() @ self.R
-        # The centre's correction, not the shift's: it is small where the turn is not.
-        here = -np.einsum("tji,tj->ti", self.R, self.t)
-        there = -np.einsum("tji,tj->ti", b.R, b.t) - here[some]
-        centre = here + np.stack([np.interp(every, some, there[:, k]) for k in range(3)], axis=1)
-        return replace(self, R=R, t=-np.einsum("tij,tj->ti", R, centre))
 
 
 Starts = Mapping[str, Sequence[tuple[State, Observations] | Bundle]]
@@ -403,7 +277,7 @@ def _decided(best: dict[str, Bundle], others: Mapping[str, Sequence[Bundle]] | N
     last = cheapest(every, clean)
     # Halves scatter with the strays in them: what misleads is not always told from the link.
     sure = widened(spread(last, clean), better, several)
-    return once, last, sure, probability, _rival(last, every, clean)
+    return once, last, sure, probability, strongest_rival(last, every, clean)
 
 
 def _near(hinges: Sequence[Bundle], s: Sightings) -> list[Bundle]:
@@ -616,150 +490,10 @@ def _hinge_of_screw(best: dict[str, Bundle], sight: Sightings) -> dict[str, Bund
     return {**best, "revolute": own} if better else best
 
 
-def type_probabilities(best: dict[str, Bundle], sight: Sightings, near: Sequence[Bundle] = ()) -> dict[str, float]:
-    """Posterior of the types, from the curvature of the hinge and the advance of the screw.
-
-    Args:
-        best: of every type.  sight: its observations.
-        near: hinges as near as hinges are. The best hinge of all may be a slide that strays have bent, so that a slide
-            which wins has to win the votes against these.
-    """
-    hinge, slide = best["revolute"], best["prismatic"]
-    X = hinge.X if sight.link is None else hinge.X[sight.link]
-    size = float(np.linalg.norm(np.quantile(X, 0.95, axis=0) - np.quantile(X, 0.05, axis=0)))
-    curvature = spread(hinge, sight).curvature
-    if "screw" in best:
-        # A body that is carried freely refutes both types together: no vote between them is asked for, but that every
-        # neighbourhood is carried so, not strays alone.
-        screw = best["screw"]
-        gain = _cost_gain(hinge, slide, sight) + calmer(hinge, slide, sight)
-        odds = log_odds_hinge(hinge.twist, curvature, size, gain)
-        gain = _cost_gain(screw, hinge, sight) + calmer(screw, hinge, sight)
-        more = log_odds_screw(screw.twist, spread(screw, sight).curvature, gain)
-        if more > 0:
-            more = tempered(more, _votes(screw, hinge, sight))
-        p = probabilities({"prismatic": 0.0, "revolute": odds, "screw": odds + more})
-        if turn_deg(screw) >= SCREW_TURN_DEG or p["screw"] >= FREE_BODY:
-            return p
-    path = calmer(hinge, slide, sight)
-    odds, by_costs, alone = (
-        log_odds_hinge(hinge.twist, curvature, size, gain)
-        for gain in (_gain(hinge, slide, sight) + path, _cost_gain(hinge, slide, sight) + path, 0.0)
-    )
-    costs, near_each_other = _costs(hinge, slide, sight), clusters(hinge, sight.link, VOTERS)
-    z, most = votes(*costs, near_each_other), majority(*costs, near_each_other)
-    few = z < FEW_SPEAK[0] and most < FEW_SPEAK[1]
-    if odds > 0 > alone and few and turn_deg(hinge) < BENT_DEG:
-        # A few strays have bent a slide: what they gain by it is no evidence, where hinges are is. But a slide whose
-        # points are no link of any shape is as likely a hinge that no start has reached.
-        odds = alone if _shapely(slide, sight) else -UNDECIDED
-    elif odds * by_costs < 0:
-        # Points that are no part of a link of any shape would turn the answer round: they are as likely to know.
-        return probabilities({"prismatic": 0.0, "revolute": float(np.clip(odds, -UNDECIDED, UNDECIDED))})
-    if odds > 0:
-        odds = tempered(odds, z)
-    elif near:
-        odds = tempered(odds, -min(_votes(slide, b, sight) for b in near))
-    if odds == 0:
-        # The votes are against what they should confirm: where most neighbourhoods are, whatever the few gain, leads.
-        odds = float(np.copysign(UNDECIDED, most))
-    return probabilities({"prismatic": 0.0, "revolute": odds})
-
-
-def _shapely(b: Bundle, sight: Sightings) -> bool:
-    """Whether nearly all points of the link are near each other."""
-    own = b.X if sight.link is None else b.X[sight.link]
-    return bool(np.mean(compact(own) & (own[:, 2] > 0)) > SHAPELY)
-
-
-def _cost_gain(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    """Log-likelihood ratio at the costs of the adjustment, where the noise's size is unknown."""
-    return one.cost / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(other.cost, 1e-9) / max(one.cost, 1e-9)))
-
-
-def calmer(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    """Log-likelihood ratio of the paths that two joints need of a camera whose path is fitted with them; 0 of one that
-    is not.
-
-    A joint of the wrong type has the camera go along with what it cannot explain. Of SPANS steps of the camera's
-    centre, each of three normal numbers of one unknown size, the likelihood with the size integrated over its logarithm
-    goes with the power of their sum of squares. What noise does to a path that is held to its px is no step.
-
-    Args:
-        one, other: of the same tracks, with poses R (T, 3, 3), t (T, 3), lengths in any unit: the link's depth is 1.
-
-    Returns:
-        Of ``one`` over ``other``: positive where its camera goes less.
-    """
-    if not sight.free:
-        return 0.0
-    sums = []
-    for b in (one, other):
-        assert b.R is not None and b.t is not None and sight.link is not None
-        unit = float(np.median(b.X[sight.link, 2]))
-        centre = -np.einsum("tji,tj->ti", b.R, b.t) / unit
-        cuts = np.linspace(0, len(centre) - 1, SPANS + 1).round().astype(int)
-        sums.append(float(np.sum(np.diff(centre[cuts], axis=0) ** 2)))
-    floor = 3 * SPANS * (NOISY_PX / sight.focal) ** 2
-    return 1.5 * SPANS * float(np.log((sums[1] + floor) / (sums[0] + floor)))
-
-
-def _costs(one: Bundle, other: Bundle, sight: Sightings) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) robust cost of every track under either, by one scale. A point out of all proportion explains nothing."""
-    limit = ROBUST_SIGMAS * max(min(one.sigma, other.sigma), 0.05)
-    out = []
-    for b in (one, other):
-        cost = track_costs(residuals(b, sight), sight, limit)
-        link = np.ones(len(b.X), bool) if sight.link is None else sight.link
-        lost = np.flatnonzero(link)[~(compact(b.X[link]) & (b.X[link, 2] > 0))]
-        cost[lost] = limit**2 * sight.weight[lost] * sight.seen[lost].sum(1)
-        out.append(cost)
-    return out[0], out[1]
-
-
-def _votes(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    return votes(*_costs(one, other, sight), clusters(one, sight.link, VOTERS))
-
-
-def _gain(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    """Log-likelihood ratio where the noise's size is unknown: so many observations times half the logarithm."""
-    a, b = (float(c.sum()) for c in _costs(one, other, sight))
-    return a / (2 * one.sigma**2 * sight.lasting) * float(np.log(max(b, 1e-9) / max(a, 1e-9)))
-
-
-def log_odds_of_same_type(one: Bundle, other: Bundle, sight: Sightings) -> float:
-    """Of two joints of one type with the points of the same tracks."""
-    return tempered(_gain(one, other, sight), _votes(one, other, sight))
-
-
 def _refitted(b: Bundle, like: Bundle, sight: Sightings) -> Bundle:
     """The joint with the points of another's tracks."""
     points = np.tile(np.median(b.X, axis=0), (len(like.X), 1))
     return polish(place_points(replace(b, X=points), sight), sight, iterations=30)
-
-
-def _rival(last: Bundle, others: Sequence[Bundle], sight: Sightings) -> Rival | None:
-    """The most probable other axis, of joints that are fitted to the answer's own tracks.
-
-    A small motion is seen nearly as from afar, and from there a body and its mirror image that turns the other way look
-    the same (Necker's reversal): what is stated of one optimum knows nothing of the next.
-    """
-    found: list[Rival] = []
-    for b in others:
-        if (apart := apart_deg(b, last)) > APART_DEG:
-            odds = log_odds_of_same_type(last, b, sight)
-            found.append(Rival(apart, float(expit(-odds)), b))
-    return max(found, key=lambda r: r.probability, default=None)
-
-
-def apart_deg(one: Bundle, other: Bundle) -> float:
-    """Angle between the axes of two joints, 0 to 90 deg."""
-    return float(np.degrees(np.arccos(np.clip(abs(one.twist.axis @ other.twist.axis), 0, 1))))
-
-
-def turn_deg(b: Bundle) -> float:
-    """By how much the link turns."""
-    return float(np.degrees(np.ptp(b.q) * np.linalg.norm(b.twist.curvature)))
 
 
 def states_of_all_frames(b: Bundle, s: Sightings, some: np.ndarray) -> Bundle:

@@ -13,17 +13,7 @@ from reconstruct.joint.bundle import Observations, State, refine, solve_depths
 from reconstruct.joint.cameras import camera_moves, joints_between
 from reconstruct.joint.evidence import free_motion
 from reconstruct.joint.faces import by_faces
-from reconstruct.joint.finish import (
-    APART_DEG,
-    Finished,
-    NoLink,
-    Starts,
-    Still,
-    View,
-    apart_deg,
-    bundle_of_state,
-    finish,
-)
+from reconstruct.joint.finish import Finished, NoLink, Starts, bundle_of_state, finish
 from reconstruct.joint.groups import Rigid, two_bodies
 from reconstruct.joint.handheld import JOINS, Path, at_rest, filmed, path_from_rest, scaled_to_link
 from reconstruct.joint.kinds import or_by_prior
@@ -50,6 +40,8 @@ from reconstruct.joint.select import (
 )
 from reconstruct.joint.slight import slight_motion
 from reconstruct.joint.sweep import EXACT_PX, SMALL, Swept, placed_on, sweep
+from reconstruct.joint.view import Still, View
+from reconstruct.joint.weigh import APART_DEG, apart_deg
 from reconstruct.video import Video
 
 MOVING_SHARE = 0.012

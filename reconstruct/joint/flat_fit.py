@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from reconstruct.cues import Tracks
-from reconstruct.joint.finish import Finished, View, followers
+from reconstruct.joint.finish import Finished, followers
 from reconstruct.joint.fit import DEFAULT_FOCAL, KNOWN_STD, PRIOR_STD
 from reconstruct.joint.flat_edges import LOOKS, EdgePlate, lines_of, plates_of
 from reconstruct.joint.models import JointFit
@@ -18,6 +18,7 @@ from reconstruct.joint.polish import Bundle, anchor_of, place_points, polish
 from reconstruct.joint.result import MIN_INLIERS, result_of
 from reconstruct.joint.twist import twist_of_joint
 from reconstruct.joint.uncertainty import spread
+from reconstruct.joint.view import View
 from reconstruct.video import Video
 
 SHARE, LEAST_DEG, FEWEST = 0.6, 5.0, 4

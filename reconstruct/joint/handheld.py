@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruct.joint.bundle import Observations, State
-from reconstruct.joint.finish import Still, View, bundle_of_state
+from reconstruct.joint.finish import bundle_of_state
 from reconstruct.joint.groups import adjust, between, resect, triangulated
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import place_points, polish
+from reconstruct.joint.view import Still, View
 
 LEAST = 40
 """Resting tracks without which no path is sought."""

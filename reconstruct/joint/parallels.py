@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from reconstruct.joint.finish import LIKELY, Finished, apart_deg, log_odds_of_same_type
+from reconstruct.joint.finish import Finished
 from reconstruct.joint.models import VAGUE_DEG
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.polish import (
@@ -31,6 +31,7 @@ from reconstruct.joint.polish import (
 )
 from reconstruct.joint.twist import Twist
 from reconstruct.joint.uncertainty import compact, spread
+from reconstruct.joint.weigh import LIKELY, apart_deg, log_odds_of_same_type
 
 WORTH_DEG = 1.5
 """Standard deviation of an axis below which the tracks are believed as they are."""

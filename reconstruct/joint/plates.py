@@ -15,12 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from reconstruct.joint.finish import APART_DEG as RIVAL_DEG
-from reconstruct.joint.finish import Finished, Rival, apart_deg, log_odds_of_same_type
+from reconstruct.joint.finish import Finished
 from reconstruct.joint.hypotheses import perpendicular_basis
 from reconstruct.joint.polish import Bundle, Sightings, anchor_of, cheapest, polish, residuals
 from reconstruct.joint.twist import twist_of_joint
 from reconstruct.joint.uncertainty import spread
+from reconstruct.joint.weigh import APART_DEG as RIVAL_DEG
+from reconstruct.joint.weigh import Rival, apart_deg, log_odds_of_same_type
 
 WORTH_DEG = 1.5
 """Standard deviation of an axis below which the tracks are believed as they are."""

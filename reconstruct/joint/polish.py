@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.joint.normal import Normal, normal_equations
 from reconstruct.joint.paths import held
-from reconstruct.joint.shape import Flat, Nearby, Reach
+from reconstruct.joint.shape import Flat, Nearby, Reach, extent
 from reconstruct.joint.twist import Twist
 
 BEND = 0.1
@@ -240,7 +240,7 @@ class _Priors:
         ends = int(held[np.argmin(b.q[held])]), int(held[np.argmax(b.q[held])])
         path = float(b.q[ends[1]] - b.q[ends[0]])
         X = b.X if s.link is None else b.X[s.link]
-        size = float(np.linalg.norm(np.quantile(X, 0.95, axis=0) - np.quantile(X, 0.05, axis=0)))
+        size = extent(X)
         reach, flat, nearby = Reach.of(b, s, sigma), Flat.of(b, s, sigma), Nearby.of(b, s, sigma)
         if b.kind == "prismatic" or path <= 0 or size <= 0:
             return cls(focal, bend, 0.0, 0.0, ends, reach, flat, nearby, s.along, parallel)
@@ -398,7 +398,7 @@ def regauged(b: Bundle, s: Sightings) -> Bundle:
     if not s.scaleless or unit <= 1e-9:
         return b
     away = anchor_of(b.kind, X, tw.axis, tw.anchor if b.kind == "prismatic" else tw.point)
-    size = float(np.linalg.norm(np.quantile(X, 0.9, axis=0) - np.quantile(X, 0.1, axis=0)))
+    size = extent(X, 0.1)
     if abs(np.log(unit)) < GAUGE and np.linalg.norm(tw.anchor - away) < max(size, 1e-9):
         return b
     velocity = tw.direction + np.cross(tw.curvature, away - tw.anchor)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from reconstruct.joint.bundle import Observations
-from reconstruct.joint.finish import View
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, residuals
 from reconstruct.joint.select import region_of
 from reconstruct.joint.sweep import Swept, placed_on, sweep
+from reconstruct.joint.view import View
 
 REGIONS = 4
 """Whose tracks are swept by themselves."""

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruct.joint.evidence import bridged, looser
-from reconstruct.joint.finish import LIKELY, SCREW_TURN_DEG, Finished, turn_deg
+from reconstruct.joint.finish import Finished
 from reconstruct.joint.models import VAGUE_DEG, JointFit
 from reconstruct.joint.polish import Bundle, Sightings, positions, residuals
 from reconstruct.joint.uncertainty import compact
+from reconstruct.joint.weigh import LIKELY, SCREW_TURN_DEG, turn_deg
 from reconstruct.joint.world import assumed_up, world_from_camera
 from reconstruct.video import Video
 

@@ -22,6 +22,17 @@ NEARBY, BEYOND = 4.0, 0.05
 deviation of the logarithm beyond."""
 
 
+def extent(X: np.ndarray, tail: float = 0.05) -> float:
+    """Diagonal of the box around points (N, k) that leaves such a share of them out at either end of each axis."""
+    return float(np.linalg.norm(np.quantile(X, 1 - tail, axis=0) - np.quantile(X, tail, axis=0)))
+
+
+def seen_across(X: np.ndarray, depth: float) -> np.ndarray:
+    """(N, 2) places of points (N, 3), camera frame, across the line of sight as if all lay at one depth: a stray far
+    before or behind the others makes them no larger."""
+    return X[:, :2] / np.maximum(X[:, 2:], 1e-3) * depth
+
+
 @dataclass(frozen=True)
 class Reach:
     """How far a link's points may lie from its middle: what is farther costs the squared distance from that sphere.
@@ -43,8 +54,7 @@ class Reach:
         link = np.ones(len(b.X), bool) if s.link is None else s.link
         X = b.X[link]
         middle = np.median(X, axis=0)
-        across = X[:, :2] / np.maximum(X[:, 2:], 1e-3) * middle[2]
-        size = float(np.linalg.norm(np.quantile(across, 0.95, axis=0) - np.quantile(across, 0.05, axis=0)))
+        size = extent(seen_across(X, middle[2]))
         weight = 0.0 if size <= 0 else s.lasting * (sigma / size) ** 2
         return cls(middle, REACH * size, np.where(link, weight, 0.0))
 
@@ -82,7 +92,7 @@ class Flat:
         """The plane through the middle of the points of N tracks; sigma: their noise, px."""
         if s.flat is None:
             return cls(0.0, np.zeros(0))
-        size = float(np.linalg.norm(np.quantile(b.X, 0.95, axis=0) - np.quantile(b.X, 0.05, axis=0)))
+        size = extent(b.X)
         weight = s.weight * s.lasting * (sigma / max(s.flat * size, 1e-9)) ** 2
         return cls(float(np.median((b.X - b.twist.anchor) @ b.twist.axis)), weight)
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from reconstruct.joint.finish import View
 from reconstruct.joint.flow import candidates, flow_of
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle
 from reconstruct.joint.sweep import FEWEST, start_of
+from reconstruct.joint.view import View
 
 SMOOTH = 5
 """Frames over which a track's place is averaged."""

@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruct.joint.bundle import Observations
-from reconstruct.joint.finish import View, followers, states_of_all_frames
+from reconstruct.joint.finish import followers, states_of_all_frames
 from reconstruct.joint.flow import Candidate, Flow, candidates, flow_of
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, Sightings, place_points, polish, radius_cost, residuals, robust_loss
 from reconstruct.joint.twist import Twist
+from reconstruct.joint.view import View
 
 SMALL = 0.06
 """Path of the fastest tracks, as a share of the image diagonal, up to which the search's pixels say too little."""

@@ -22,7 +22,7 @@ from reconstruct.joint.polish import (
     residuals,
     robust_loss,
 )
-from reconstruct.joint.shape import Flat
+from reconstruct.joint.shape import Flat, extent, seen_across
 from reconstruct.joint.states import unlinked
 
 CELL = 0.06
@@ -56,7 +56,7 @@ def clusters(b: Bundle, link: np.ndarray | None = None, cell: float = CELL) -> n
     """(N,) cluster number of each track: cells of space on the link, and on what rests beside it."""
     link = np.ones(len(b.X), bool) if link is None else link
     own = b.X[link]
-    size = np.linalg.norm(np.quantile(own, 0.9, axis=0) - np.quantile(own, 0.1, axis=0))
+    size = extent(own, 0.1)
     key = np.floor((b.X - np.median(own, axis=0)) / max(cell * size, 1e-9)).astype(int)
     key = np.concatenate([key, link[:, None]], axis=1)
     return np.unique(key, axis=0, return_inverse=True)[1].ravel()
@@ -69,8 +69,7 @@ def compact(X: np.ndarray, reach: float = 2.5) -> np.ndarray:
     read across the line of sight, where strays count as everything else.
     """
     middle = np.median(X, axis=0)
-    across = X[:, :2] / np.maximum(X[:, 2:], 1e-3) * middle[2]
-    size = float(np.linalg.norm(np.quantile(across, 0.9, axis=0) - np.quantile(across, 0.1, axis=0)))
+    size = extent(seen_across(X, middle[2]), 0.1)
     return np.linalg.norm(X - middle, axis=1) < reach * max(size, 1e-6)
 
 

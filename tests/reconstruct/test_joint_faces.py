@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint.faces import WORTH_DEG, belonging, by_faces
-from reconstruct.joint.finish import Finished, View
+from reconstruct.joint.finish import Finished
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.photometric import Adjustment, Pictures, Reader, Surface, spread_of
 from reconstruct.joint.polish import Bundle, Sightings, polish
 from reconstruct.joint.twist import Twist
 from reconstruct.joint.uncertainty import spread
+from reconstruct.joint.view import View
 from reconstruct.video import Video
 
 W, H, FOCAL, T = 320, 240, 300.0, 30

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.joint.finish import View, _decided, finish
+from reconstruct.joint.finish import _decided, finish
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import HOLDERS, Bundle, cheapest, place_points, polish
 from reconstruct.joint.twist import Twist
+from reconstruct.joint.view import View
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
 

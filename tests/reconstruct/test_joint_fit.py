@@ -8,12 +8,13 @@ import pytest
 from reconstruct.cues import ProviderInfo, Tracks
 from reconstruct.joint import fit as fit_module
 from reconstruct.joint.bundle import Observations, State, refine, solve_depths
-from reconstruct.joint.finish import View, finish
+from reconstruct.joint.finish import finish
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.models import JointFit, joint_transform
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.result import FREELY
 from reconstruct.joint.select import _tilted_back, explained, key_frames, observations, search_regions, worth
+from reconstruct.joint.view import View
 from tests.reconstruct.joint_scenes import H, W, make_scene, make_video, project
 
 SLAB = [[-0.3, 0.3], [-0.4, 0.0], [-0.02, 0.02]]

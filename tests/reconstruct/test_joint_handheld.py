@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import reconstruct.joint.handheld as handheld
 from reconstruct.cues import ProviderInfo, Tracks
-from reconstruct.joint.finish import Still, View, _costs, _hinge_of_screw, calmer, turn_deg
+from reconstruct.joint.finish import _hinge_of_screw
 from reconstruct.joint.fit import fit_joint
 from reconstruct.joint.handheld import at_rest, filmed, path_from_rest
 from reconstruct.joint.models import joint_transform
@@ -19,6 +19,8 @@ from reconstruct.joint.select import key_frames, observations
 from reconstruct.joint.shape import NEARBY, Nearby, Reach
 from reconstruct.joint.sweep import sweep
 from reconstruct.joint.twist import Twist, twist_of_joint
+from reconstruct.joint.view import Still, View
+from reconstruct.joint.weigh import calmer, costs_of_both, turn_deg
 from tests.reconstruct.joint_scenes import FOCAL, H, W, make_video, project
 
 CENTRE = np.array([(W - 1) / 2, (H - 1) / 2])
@@ -355,7 +357,7 @@ def test_points_out_of_all_proportion_explain_nothing_before_a_moving_camera_eit
     s = Sightings(np.zeros((60, T, 2)), np.ones((60, T), bool), np.ones(60), FOCAL, link=link)
     near = Bundle("revolute", Twist(np.zeros(3), np.array([1.0, 0, 0]), np.zeros(3)), np.zeros(T), X, sigma=0.1)
     s = replace(s, uv=near.X[:, None, :2].repeat(T, axis=1) / near.X[:, None, 2:] * FOCAL)
-    costs, others = _costs(near, replace(near, kind="prismatic", X=wide), s)
+    costs, others = costs_of_both(near, replace(near, kind="prismatic", X=wide), s)
     assert costs.max() < 1e-6 and not others[10:].any()
     np.testing.assert_allclose(others[:10], (0.4**2) * T)
 

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.finish import Finished, Rival, View
+from reconstruct.joint.finish import Finished
 from reconstruct.joint.parallels import WORTH_DEG, along_edges, edge_directions
 from reconstruct.joint.photometric import Pictures
 from reconstruct.joint.polish import Bundle, Sightings, parallel_deg, polish, positions
 from reconstruct.joint.result import result_of
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import spread
+from reconstruct.joint.view import View
+from reconstruct.joint.weigh import Rival
 from reconstruct.video import Video
 
 W, H, FOCAL, T = 640, 480, 600.0, 24

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reconstruct.cues import Hands, ProviderInfo
-from reconstruct.joint.finish import View
 from reconstruct.joint.fit import moving_tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.paths import Paths, held
 from reconstruct.joint.polish import Reach, normal_equations, place_points, polish, positions, residuals
 from reconstruct.joint.result import stay
 from reconstruct.joint.shadows import maybe_shadows, unless_a_shadow
+from reconstruct.joint.view import View
 from reconstruct.pipeline import joint_off_the_arm
 from reconstruct.providers.lk_tracks import slip_of
 from reconstruct.providers.shade import one_colour, rest_beneath

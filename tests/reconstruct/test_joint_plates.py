@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.finish import Finished, View, turn_deg
+from reconstruct.joint.finish import Finished
 from reconstruct.joint.normal import normal_equations
 from reconstruct.joint.plates import FEWEST, FLAT, WORTH_DEG, _starts, as_plate
 from reconstruct.joint.polish import Bundle, Sightings, polish, positions, residuals, robust_loss
 from reconstruct.joint.shape import Flat
 from reconstruct.joint.twist import twist_of_joint
 from reconstruct.joint.uncertainty import spread
+from reconstruct.joint.view import View
+from reconstruct.joint.weigh import turn_deg
 
 FOCAL, T, N = 600.0, 24, 80
 AXIS = Rotation.from_euler("xy", [40, 15], degrees=True).apply([0, 0, 1.0])

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from reconstruct.joint.finish import FREE_BODY, type_probabilities
 from reconstruct.joint.kinds import tempered, votes
 from reconstruct.joint.models import joint_transform
 from reconstruct.joint.polish import (
@@ -24,6 +23,7 @@ from reconstruct.joint.polish import (
 )
 from reconstruct.joint.twist import Twist, twist_of_joint
 from reconstruct.joint.uncertainty import compact, lasting_error, shared_error, spread, strayed
+from reconstruct.joint.weigh import FREE_BODY, type_probabilities
 
 FOCAL, SIGMA = 700.0, 0.5
 number = st.floats(-2, 2)
@@ -219,8 +219,8 @@ def test_where_the_votes_are_against_the_odds_the_side_of_most_neighbourhoods_le
     near = replace(truth, kind="revolute", twist=replace(truth.twist, curvature=2.0 * across))
     best = {"prismatic": polish(truth, s), "revolute": polish(near, s, iterations=60)}
     assert type_probabilities(best, s, [near])["prismatic"] > 0.9
-    monkeypatch.setattr("reconstruct.joint.finish.votes", lambda *_: -1.0)
-    monkeypatch.setattr("reconstruct.joint.finish.majority", lambda *_: most)
+    monkeypatch.setattr("reconstruct.joint.weigh.votes", lambda *_: -1.0)
+    monkeypatch.setattr("reconstruct.joint.weigh.majority", lambda *_: most)
     p = type_probabilities(best, s, [near])
     assert max(p, key=lambda kind: p[kind]) == leads
     assert p[leads] < 0.9

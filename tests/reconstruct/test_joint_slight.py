@@ -7,10 +7,11 @@ import pytest
 
 from reconstruct.joint import fit as fitting
 from reconstruct.joint.answers import FACTOR, better_known
-from reconstruct.joint.finish import Rival, View
 from reconstruct.joint.flow import flow_of
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.slight import _leaves, slight_motion
+from reconstruct.joint.view import View
+from reconstruct.joint.weigh import Rival
 from tests.reconstruct import joint_scenes
 from tests.reconstruct.joint_scenes import made, make_scene
 from tests.reconstruct.test_joint_flow import FOCAL, tracks

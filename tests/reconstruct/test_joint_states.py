@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reconstruct.joint.finish import View, finish
+from reconstruct.joint.finish import finish
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import Bundle, frames_held, polish, positions, residuals
 from reconstruct.joint.states import found_again, held_frames, held_only, in_sight_only, unlinked, with_states
+from reconstruct.joint.view import View
 from tests.reconstruct.test_joint_polish import FOCAL, scene
 
 KINDS = ("revolute", "prismatic")

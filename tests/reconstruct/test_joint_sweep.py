@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from reconstruct.joint.finish import View
 from reconstruct.joint.fit import moving_tracks
 from reconstruct.joint.paths import Paths
 from reconstruct.joint.polish import polish
 from reconstruct.joint.select import key_frames, observations
 from reconstruct.joint.sweep import sweep
+from reconstruct.joint.view import View
 from tests.reconstruct.joint_scenes import FOCAL, H, W, make_scene
 
 CENTRE = np.array([(W - 1) / 2, (H - 1) / 2])
