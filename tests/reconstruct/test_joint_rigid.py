@@ -147,6 +147,18 @@ def test_noisy_tracks_err_as_stated(kind):
     assert 0.15 < np.median(z_axis) < 1.8
 
 
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_type_that_started_badly_is_judged_as_the_others_are(kind, seed, monkeypatch):
+    """What is far behind is judged on the frames it was fitted to: that alone must not make it the answer."""
+    monkeypatch.setattr("reconstruct.joint.rigid.fit.HOPELESS", 0.0)
+    q = STROKE * (0.3 if kind == "prismatic" else 1.0)
+    uv, visible, z, pose, link = tracks_of(kind, q, seed=seed, orbit=0.5, **NOISE)
+    fit = fit_rigid(uv, visible, z, K, pose, link, seed=seed)
+    assert (fit.verdict, fit.type) == ("ok", kind), fit.reason
+    assert angle(fit.axis, AXIS) < 1.0
+
+
 def test_link_is_told_from_its_motion_without_masks():
     uv, visible, z, pose, _ = tracks_of("revolute", STROKE, **NOISE)
     fit = fit_rigid(uv, visible, z, K, pose)

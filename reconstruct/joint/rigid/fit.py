@@ -34,6 +34,8 @@ TRIES = {"prismatic": 2, "revolute": 3, "screw": 1}
 """Hypotheses of each type that are refined; a screw is also started from the best hinge."""
 HOPELESS = 400.0
 """A type whose robust cost is so much above the best one's needs no closer look."""
+HOLDING = {"prismatic": {"revolute", "screw"}, "revolute": {"screw"}, "screw": set()}
+"""Types that have another as a special case: what is worse than that has only started badly."""
 AGREE = 0.35
 """Share of the link's observations that has to agree with the joint."""
 SURE = 0.9
@@ -195,6 +197,7 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
     last = {st.twist.kind: st}
     least = min(cost for _, cost in first.values())
     lost = {kind for kind, (_, cost) in first.items() if cost > least + HOPELESS * inflation}
+    lost -= HOLDING[st.twist.kind]
     if st.twist.kind == "screw":  # what it holds as special cases may only have started badly
         lost -= {kind for kind in lost if _holds(st, kind, obs, noise, inflation)}
     last |= {kind: first[kind][0] for kind in lost}
@@ -205,6 +208,8 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
             last[kind] = refine(min(options, key=lambda o: o[1])[0], obs, noise, None, iterations=4)[0]
     agreed = replace(obs, seen=good > 0, ranged=obs.ranged & (good > 0))
     probability = weigh_types(last, agreed, noise, inflation, lost).probability
+    if max(probability, key=probability.get) in lost:  # judged where it was fitted, the others where they were not
+        probability = weigh_types(last, agreed, noise, inflation).probability
     return last[max(probability, key=probability.get)], probability, noise
 
 
