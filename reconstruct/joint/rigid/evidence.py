@@ -18,6 +18,8 @@ TURN_PRIOR = 1.0
 over the link's size where that is less."""
 PITCH_PRIOR = 0.3
 """Shift along the axis over a screw's stroke, in sizes of the link."""
+HOLDING = {"prismatic": {"revolute", "screw"}, "revolute": {"screw"}, "screw": set[str]()}
+"""Types that have another as a special case."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,8 @@ def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, infla
     The frames are cut into blocks; each fold is fitted without every other block, and the left-out frames are then
     explained with the joint and the points fixed and only their states and depth errors free. A difference of these
     held-out likelihoods (over the inflation by correlated errors) is a data term that no type gets for free by its
-    extra parameters; what it does not see, how improbable a priori it is that a hinge comes out as a slide, is the
-    ratio of prior to posterior width (Savage-Dickey).
+    extra parameters, and none more than it gains where it is fitted; what it does not see, how improbable a priori it
+    is that a hinge comes out as a slide, is the ratio of prior to posterior width (Savage-Dickey).
     """
     heldout = dict.fromkeys(states, 0.0)
     T = obs.seen.shape[1]
@@ -54,9 +56,13 @@ def weigh_types(states: dict[str, State], obs: Observations, noise: Noise, infla
         for kind, st in states.items():
             if kind not in lost:
                 heldout[kind] += _heldout(st, obs, noise, out) / 2 / inflation
-    for kind in lost:  # not fitted again: by what it leaves where it was fitted
-        r, _, _ = residuals(states[kind], obs, noise)
-        heldout[kind] = weigh(r, obs, np.inf)[1] / 2 / inflation
+    fitted = {kind: weigh(residuals(st, obs, noise)[0], obs, np.inf)[1] / 2 / inflation for kind, st in states.items()}
+    heldout |= {kind: fitted[kind] for kind in lost}  # not fitted again: by what it leaves where it was fitted
+    for kind in KINDS:
+        # No type is likelier than its best fit: what it gains beyond that over its own special case, the frames left
+        # out happened to do. A light that goes 5 mm was a hinge by 63 nats, and fitted to all frames by 0.3.
+        for more in HOLDING[kind] & states.keys() if kind in states else ():
+            heldout[more] = max(heldout[more], heldout[kind] - max(fitted[kind] - fitted[more], 0.0))
     occam = {kind: _occam(st, obs, noise, inflation) for kind, st in states.items()}
     score = {kind: np.log(PRIOR[kind]) - heldout[kind] - occam[kind] for kind in states}
     top = max(score.values())

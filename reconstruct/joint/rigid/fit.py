@@ -19,7 +19,7 @@ from reconstruct.joint.rigid.bundle import (
     residuals,
     weigh,
 )
-from reconstruct.joint.rigid.evidence import weigh_types
+from reconstruct.joint.rigid.evidence import HOLDING, weigh_types
 from reconstruct.joint.rigid.kabsch import Poses, hypotheses, register
 from reconstruct.joint.rigid.normal import OWN, covariance, normal_equations
 from reconstruct.joint.rigid.observe import Noise, Observations, observe, robust_mean, static_field
@@ -34,8 +34,6 @@ TRIES = {"prismatic": 2, "revolute": 3, "screw": 1}
 """Hypotheses of each type that are refined; a screw is also started from the best hinge."""
 HOPELESS = 400.0
 """A type whose robust cost is so much above the best one's needs no closer look."""
-HOLDING = {"prismatic": {"revolute", "screw"}, "revolute": {"screw"}, "screw": set()}
-"""Types that have another as a special case: what is worse than that has only started badly."""
 AGREE = 0.35
 """Share of the link's observations that has to agree with the joint."""
 SURE = 0.9
@@ -197,7 +195,7 @@ def _decide(states: dict[str, State], obs: Observations, noise: Noise) -> tuple[
     last = {st.twist.kind: st}
     least = min(cost for _, cost in first.values())
     lost = {kind for kind, (_, cost) in first.items() if cost > least + HOPELESS * inflation}
-    lost -= HOLDING[st.twist.kind]
+    lost -= HOLDING[st.twist.kind]  # worse than their own special case, they have only started badly
     if st.twist.kind == "screw":  # what it holds as special cases may only have started badly
         lost -= {kind for kind in lost if _holds(st, kind, obs, noise, inflation)}
     last |= {kind: first[kind][0] for kind in lost}
