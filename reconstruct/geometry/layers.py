@@ -232,6 +232,9 @@ def to_lab(image: np.ndarray) -> np.ndarray:
     return lab
 
 
+ROUNDS, GROWS = 2, 0.005
+"""Rounds in which the background is learned anew in any case, and the share by which a further one has to enlarge the
+link for its outline to count."""
 RESTS_PX, LEAVES_PX = 1.0, 4.0
 """A track rests if it stays this close to its median place, working px; it contradicts a cell of the link that would
 have carried it further than that."""
@@ -273,7 +276,7 @@ def resting_cells(video: Video, tracks: Tracks, fit: JointFit, plane: LinkPlane,
 
 
 def gather(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, plane: LinkPlane, costs: np.ndarray,
-           count: int = 24, rounds: int = 2) -> Evidence:
+           count: int = 24, rounds: int = 20) -> Evidence:
     """Which cells of the link's plane are link.
 
     Args:
@@ -284,7 +287,9 @@ def gather(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, plane: Lin
         plane: from :func:`reconstruct.geometry.plane.fit_plane`.
         costs: (T,) from :func:`frame_costs`.
         count: frames to look at.
-        rounds: times that the background is learned anew with the link's better outline excluded.
+        rounds: times at most that the background is learned anew with the link's better outline excluded; after the
+            first as long as that grows. Where the link goes less than its own width, what lies beyond its points is its
+            own background until the outline has grown there.
     """
     import cv2
 
@@ -315,25 +320,25 @@ def gather(video: Video, hands: Hands, tracks: Tracks, fit: JointFit, plane: Lin
     facing = np.sign(plane.facing[frames])
     link_miss = _link_residual(warped, usable, uv, facing, fit.q[frames])
     rests = resting_cells(video, tracks, fit, plane, chart, frames).sum(0) >= 2
-    occupied = seed
+    occupied, covered = seed, path
     score = np.zeros(chart.shape)
     seen = np.zeros(chart.shape, int)
     weight = np.abs(plane.facing[frames])[:, None, None]
-    for _ in range(rounds):
+    for n in range(rounds):
         grown = cv2.dilate(occupied.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        covered = np.stack([warp_to_image(chart, grown, H[k], size) for k in range(len(frames))])
-        back_miss = np.stack([sample(b, k) for k, b in enumerate(background_residual(images, covered | hand, path))])
+        over = np.stack([warp_to_image(chart, grown, H[k], size) for k in range(len(frames))])
+        back_miss = np.stack([sample(b, k) for k, b in enumerate(background_residual(images, over | hand, path))])
         known = usable & (back_miss >= 0) & np.isfinite(link_miss)
         ratio = np.clip((back_miss - np.where(known, link_miss, 0.0)) / (2 * noise), -3, 3)
         votes = np.where(known, weight * ratio, 0.0)
-        total = (weight * known).sum(0)
-        score = votes.sum(0) / np.maximum(total, 1e-9)
-        seen = known.sum(0)
-        score = np.where(seen >= 2, score, 0.0)
+        told = np.where(known.sum(0) >= 2, votes.sum(0) / np.maximum((weight * known).sum(0), 1e-9), 0.0)
         # Points seen at rest overrule colours that say "link", no more: they lie where there is texture only.
-        score = np.where(rests, np.minimum(score, -0.5), score)
-        seen = np.where(rests, np.maximum(seen, 6), seen)
-        occupied = _smooth(score, seen, seed, warped, usable)
+        told = np.where(rests, np.minimum(told, -0.5), told)
+        shown = np.where(rests, np.maximum(known.sum(0), 6), known.sum(0))
+        outline = _smooth(told, shown, seed, warped, usable)
+        if n >= ROUNDS and outline.sum() <= (1 + GROWS) * occupied.sum():
+            break
+        occupied, covered, score, seen = outline, over, told, shown
     nowhere = np.zeros(covered.shape, bool)
     shaded = _shaded(background_residual(images, covered | hand, nowhere), hand, noise,
                      apply_homography(S, fit.project(_carried(fit, frames))))

@@ -321,13 +321,16 @@ def build_shape(face: Face, fit: JointFit, plane: LinkPlane) -> Shape:
 def reach_behind(plane: LinkPlane) -> float:
     """How far behind the plane the link's body is known to reach, world units, 0 if nothing is.
 
-    It is the median of points there whose tracks the plane cannot explain, if they are many and beyond the others'
-    scatter. Nothing in front counts: a body there would hide the face, so that it is something that stands on it.
+    Points there whose tracks the plane misses tell, if they are many and beyond the others' scatter: their upper
+    quartile, as they are spread over a rim from the face on, and some are strays. Nothing in front counts: a body there
+    would hide the face, so that it is something that stands on it.
     """
-    noise = 2 * float(np.quantile(np.abs(plane.spread[plane.inlier]), 0.9)) if plane.inlier.any() else 0.0
-    behind = -plane.spread[~plane.inlier]
+    noise = 2 * float(np.quantile(np.abs(plane.spread[~plane.beside]), 0.9)) if not plane.beside.all() else 0.0
+    behind = -plane.spread[plane.beside]
     behind = behind[(behind > noise) & (behind < 0.5 * plane.extent)]
-    return float(np.median(behind)) if len(behind) >= max(5, 0.08 * len(plane.spread)) else 0.0
+    if len(behind) < max(5, 0.08 * len(plane.spread)):
+        return 0.0
+    return float(np.quantile(behind, 0.75))
 
 
 def _carve(views: Views, fit: JointFit, plane: LinkPlane, chart: Chart, low: float, high: float

@@ -17,6 +17,8 @@ from reconstruct.cues import Tracks
 from reconstruct.joint.models import JointFit
 from reconstruct.video import Video
 
+BESIDE, BESIDE_PX = 3.0, 1.0
+"""By how many times the median error, and by how many full px at least, the plane misses tracks that are not on it."""
 OBLIQUE = 2.0
 """A plane oblique to the hinge must explain the tracks this many times as well as one along or across it."""
 
@@ -32,6 +34,7 @@ class LinkPlane:
         residual_px: robust mean error of the tracks when each point is put onto the plane, full px.
         spread: (M,) signed distance of every fitted point to the plane, world units.
         inlier: (M,) bool, points whose tracks the plane explains.
+        beside: (M,) bool, points whose tracks it misses by far more than most: they are on the link, not on its face.
         extent: size of the inliers in the plane (their 2D bounding box's diagonal), world units.
         facing: (T,) cosine between the normal and the direction to the camera in every frame.
     """
@@ -41,6 +44,7 @@ class LinkPlane:
     residual_px: float
     spread: np.ndarray
     inlier: np.ndarray
+    beside: np.ndarray
     extent: float
     facing: np.ndarray
 
@@ -61,7 +65,7 @@ def keep_points(fit: JointFit, plane: LinkPlane, good: np.ndarray) -> tuple[Join
     few = good & plane.inlier
     good = good if few.sum() >= 3 else good | plane.inlier
     return (replace(fit, points=np.asarray(fit.points)[good], point_track=np.asarray(fit.point_track)[good]),
-            replace(plane, inlier=plane.inlier[good], spread=plane.spread[good]))
+            replace(plane, inlier=plane.inlier[good], beside=plane.beside[good], spread=plane.spread[good]))
 
 
 def working_matrix(video: Video, scale: float = 1.0) -> np.ndarray:
@@ -201,6 +205,7 @@ def fit_plane(tracks: Tracks, fit: JointFit) -> LinkPlane:
     inlier = errors <= max(3 * judge.unit, 1.5 * float(np.median(errors)))
     if inlier.sum() < 3:
         inlier = errors <= np.sort(errors)[min(2, len(errors) - 1)]
+    beside = errors > max(BESIDE * float(np.median(errors)), BESIDE_PX)
     on = points[inlier] - spread[inlier, None] * normal
     origin = np.median(on, axis=0)
     u = axis - (axis @ normal) * normal
@@ -221,7 +226,7 @@ def fit_plane(tracks: Tracks, fit: JointFit) -> LinkPlane:
     pose[:3, :4] = np.stack([u, v, normal, origin], axis=1)
     flat = (on - origin) @ pose[:3, :2]
     extent = float(np.linalg.norm(np.ptp(flat, axis=0)))
-    return LinkPlane(pose, kind, cost, spread, inlier, extent, facing)
+    return LinkPlane(pose, kind, cost, spread, inlier, beside, extent, facing)
 
 
 def _polish(judge: _PlaneJudge, kind: str, axis: np.ndarray, cost: float, normal: np.ndarray,

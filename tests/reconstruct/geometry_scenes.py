@@ -56,12 +56,12 @@ def _faces(low: np.ndarray, high: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
 
 
 def make_scene(kind: str = "revolute", unit: float = 1.0, seed: int = 0, hand: bool = True, bar: bool = False,
-               shadow: bool = False) -> Scene:  # fmt: skip
+               shadow: bool = False, plain: bool = False) -> Scene:  # fmt: skip
     """A slab 0.4 x 0.02 x 0.3 (times ``unit``) that turns about its left edge or slides sideways.
 
     A pale disc, the hand, rides on the free edge and is in ``hands``.  bar: a dark :data:`BAR` stands before its face.
     shadow: the background below it is dark where the slab's plane goes on, and the last 12 points follow
-    that shadow's corners.
+    that shadow's corners.  plain: it has one colour all over.
     """
     rng = np.random.default_rng(seed)
     low, high = np.array([0.0, -0.01, 0.0]) * unit, np.array([0.4, 0.01, 0.3]) * unit
@@ -81,7 +81,8 @@ def make_scene(kind: str = "revolute", unit: float = 1.0, seed: int = 0, hand: b
     fit = JointFit("ok", "", kind, {kind: 1.0}, axis, point, q=q, frames=np.arange(FRAMES), K=K, T_camera_world=T_cw,
                    metric=unit == 1.0, residual_px=0.5, moving_frames=np.abs(np.gradient(q)) > 0)
     back = cv2.resize(_texture(rng, (120, 110, 90)), (WIDTH, HEIGHT))
-    skins = [_texture(rng, (70, 130, 190)) for _ in range(6)]
+    even = np.full((128, 128, 3), (70, 130, 190), np.uint8)
+    skins = [even if plain else _texture(rng, (70, 130, 190)) for _ in range(6)]
     faces = _faces(low, high)
     if bar:
         faces += _faces(*(BAR * unit))

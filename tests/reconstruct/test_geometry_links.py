@@ -12,10 +12,19 @@ import trimesh
 from reconstruct.errors import TaaError
 from reconstruct.geometry import Geometry, LinkMesh
 from reconstruct.geometry.collision import contacts_over_range, convex_parts, keep_clear, trim_parts
-from reconstruct.geometry.layers import make_chart, resting_cells, seed_polygon, warp_to_image
+from reconstruct.geometry.layers import (
+    fill,
+    frame_costs,
+    gather,
+    make_chart,
+    resting_cells,
+    seed_polygon,
+    warp_to_image,
+)
 from reconstruct.geometry.links import build_geometry
 from reconstruct.geometry.masks import segment_links
-from reconstruct.geometry.plane import fit_plane, homography, working_matrix
+from reconstruct.geometry.outline import reach_behind
+from reconstruct.geometry.plane import LinkPlane, fit_plane, homography, working_matrix
 from reconstruct.geometry.solids import hull, swept_hulls, to_arrays
 from reconstruct.joint.models import JointFit
 from tests.reconstruct.geometry_scenes import make_scene
@@ -59,6 +68,35 @@ def test_masks_follow_the_link_and_leave_out_the_hand(door):
     assert not (masks.moving & masks.hand).any()
     assert not (masks.moving & masks.static).any()
     assert masks.confidence.shape == (len(scene.video),) and (masks.confidence <= 1).all()
+
+
+def test_the_outline_of_an_even_link_grows_beyond_its_points():
+    """It goes less than its own height: above its points it is its own background until the outline has grown."""
+    scene = make_scene("revolute", hand=False, plain=True)
+    low = np.asarray(scene.fit.points)[:, 2] < 0.2
+    fit = replace(scene.fit, points=scene.fit.points[low], point_track=scene.fit.point_track[low])
+    plane = fit_plane(scene.tracks, fit)
+    costs = frame_costs(scene.video, scene.tracks, fit, scene.hands.mask)
+    face = np.array([[0.0, -0.01, 0.0], [0.4, -0.01, 0.0], [0.4, -0.01, 0.3], [0.0, -0.01, 0.3]])
+
+    def right(rounds: int) -> float:
+        evidence = gather(scene.video, scene.hands, scene.tracks, fit, plane, costs, rounds=rounds)
+        return _iou(evidence.occupied, fill(evidence.chart, plane.to_plane(face)[:, :2]))
+
+    few, many = right(2), right(20)
+    assert few < 0.4 and many > 0.7
+
+
+@pytest.mark.parametrize("strays", [0, 3])
+@pytest.mark.parametrize(("rim", "told"), [(30, True), (4, False)])
+def test_points_on_a_rim_tell_how_far_back_it_goes(rim, told, strays):
+    """Of 100 on the face and so many spread over a rim 30 mm deep, with some far behind it."""
+    rng = np.random.default_rng(0)
+    spread = np.concatenate([rng.normal(0, 3e-4, 100), -rng.uniform(0, 0.03, rim), -rng.uniform(0.05, 0.15, strays)])
+    beside = np.arange(len(spread)) >= 100
+    plane = LinkPlane(np.eye(4), "free", 0.2, spread, np.ones(len(spread), bool), beside, 0.4, np.ones(5))
+    found = reach_behind(plane)
+    assert 0.018 < found < 0.031 if told else found == 0.0
 
 
 def test_points_seen_at_rest_lie_beside_the_link(door):

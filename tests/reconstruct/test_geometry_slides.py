@@ -30,7 +30,7 @@ def slide(axis: np.ndarray, kind: str = "prismatic") -> JointFit:
 def face(normal: np.ndarray, u: np.ndarray) -> LinkPlane:
     pose = np.eye(4)
     pose[:3, :3] = np.stack([u, np.cross(normal, u), normal], axis=1)
-    return LinkPlane(pose, "free", 0.5, np.zeros(3), np.ones(3, bool), 0.5, np.ones(7))
+    return LinkPlane(pose, "free", 0.5, np.zeros(3), np.ones(3, bool), np.zeros(3, bool), 0.5, np.ones(7))
 
 
 def slab(outline: Polygon, thickness: float = 0.018) -> Shape:
