@@ -51,11 +51,16 @@ def better_known(joint: JointFit, than: JointFit) -> JointFit | None:
         return joint
     if joint.type == than.type:
         return replace(joint, verdict="ambiguous")
-    types = {**than.type_probability, **joint.type_probability}
-    p = {k: (joint.type_probability.get(k, 0.0) + than.type_probability.get(k, 0.0)) / 2 for k in types}
-    if max(p, key=lambda k: p[k]) != joint.type:
+    p = types_of_both(joint, than)
+    if p.get(joint.type, 0.0) < max(p.values()):
         return None
     return replace(joint, verdict="ambiguous", type_probability=p)
+
+
+def types_of_both(one: JointFit, other: JointFit) -> dict[str, float]:
+    """Probabilities of the types by two joints, in the mean."""
+    types = {**other.type_probability, **one.type_probability}
+    return {k: (one.type_probability.get(k, 0.0) + other.type_probability.get(k, 0.0)) / 2 for k in types}
 
 
 def alone_deg(fit: JointFit) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from reconstruct.cues import Hands, Tracks
-from reconstruct.joint.answers import AS_WELL, FACTOR, alone_deg, contradicts, doubtful, is_open
+from reconstruct.joint.answers import AS_WELL, FACTOR, alone_deg, contradicts, doubtful, is_open, types_of_both
 from reconstruct.joint.models import JointFit
 from reconstruct.joint.result import FREELY
 from reconstruct.video import Video
@@ -28,8 +28,9 @@ def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Han
 
     One that contradicts an open one, which may rest on more than points, has to know the axis AS_WELL times better than
     that as it is stated: what slides along rims agrees as well. Of the same type it counts too, however well it knows
-    the axis, if MANY times as many tracks follow it more exactly. Not where a body that is carried freely refutes the
-    joint, nor before a camera that moves.
+    the axis, if MANY times as many tracks follow it more exactly. Of another type it counts only if that is the more
+    probable one by both in the mean. Not where a body that is carried freely refutes the joint, nor before a camera
+    that moves.
 
     Args:
         fit: the joint of these tracks, or a refusal.
@@ -46,6 +47,9 @@ def unless_hands_hide_it(fit: JointFit, video: Video, tracks: Tracks, hands: Han
     if refused:
         return (closer, doubtful(found, SHOW_NONE)) if found.verdict == "ok" else (tracks, fit)
     if found.verdict == "refused" or "axis_deg" not in found.std:
+        return tracks, fit
+    p = types_of_both(found, fit)
+    if p[found.type] < p[fit.type]:
         return tracks, fit
     least = AS_WELL * FACTOR if contradicts(fit, found) else 1.0
     better = least * alone_deg(found) < alone_deg(fit) or (

@@ -30,7 +30,7 @@ from reconstruct.joint.polish import (
     radius_cost,
 )
 from reconstruct.joint.twist import Twist
-from reconstruct.joint.uncertainty import compact, spread
+from reconstruct.joint.uncertainty import Spread, compact, spread
 from reconstruct.joint.weigh import LIKELY, apart_deg, log_odds_of_same_type
 
 WORTH_DEG = 1.5
@@ -53,6 +53,8 @@ ONE_DEG = 2.5
 """Directions so near to each other are one."""
 ALONG = 0.5
 """Prior that the axis is along any of these edges."""
+APART_STDS = 2.0
+"""Standard deviations of its own axis by which the tracks contradict a direction that is more probable."""
 AWAY, AWAY_PX = 1.5, 0.05
 """How many times worse, and by how many px, tracks may keep to the best joint along a direction than to the best of
 all."""
@@ -196,7 +198,9 @@ def _refined(R: np.ndarray, edges: _Edges, rounds: int = 5) -> np.ndarray:
 
 
 def along_edges(done: Finished, pictures: Pictures) -> Finished:
-    """A joint whose axis goes along edges of the picture, where these hold it better than its tracks; else ``done``.
+    """A joint whose axis goes along edges of the picture, where these hold it better than its tracks, or are more
+    probable and further from what these say than they may be; else ``done``, known no better than it is far from a more
+    probable one.
 
     Args:
         done: before a resting camera, of all frames of the video.  pictures: of the same frames.
@@ -220,21 +224,31 @@ def along_edges(done: Finished, pictures: Pictures) -> Finished:
     k = int(np.argmax(p))
     if k == len(asked):
         return done
-    best = asked[k]
-    apart = [apart_deg(best.bundle, a.bundle) for a in asked]
-    apart = np.array([*apart, max(free, apart_deg(best.bundle, b))])
+    best, away = asked[k], apart_deg(asked[k].bundle, b)
+    apart = np.array([*(apart_deg(best.bundle, a.bundle) for a in asked), max(free, away)])
     sure = spread(best.bundle, best.sight)
     others = np.sqrt(np.sum(np.delete(p * apart**2, k)))
     axis_deg = float(np.hypot(np.sqrt(2) * parallel_deg(sight), others))
-    if axis_deg >= free:
+    if away > APART_STDS * free:
+        # An axis so far from a more probable one is known no better than the two of them are apart.
+        own = float(np.sqrt(p @ np.append([apart_deg(a.bundle, b) for a in asked], free) ** 2))
+        if axis_deg >= own:
+            return replace(done, spread=replace(_scaled(done.spread, own / free), axis_deg=own))
+        free = max(free, away / APART_STDS)
+    elif axis_deg >= free:
         return done
-    ratio = axis_deg / max(free, 1e-9)
-    sure = replace(sure, axis_deg=axis_deg, q=np.maximum(sure.q, ratio * done.spread.q),
-                   point=max(sure.point, ratio * done.spread.point), stroke=done.spread.stroke)  # fmt: skip
+    alone = _scaled(done.spread, axis_deg / max(free, 1e-9))
+    sure = replace(sure, axis_deg=axis_deg, q=np.maximum(sure.q, alone.q), point=max(sure.point, alone.point),
+                   stroke=alone.stroke)  # fmt: skip
     words = f"its tracks alone hold the axis to {free:.0f} deg only"
     doubt = words if done.rival is not None and done.rival.probability > LIKELY or free > VAGUE_DEG else ""
     return replace(done, bundle=best.bundle, sight=best.sight, spread=sure, rival=None, once=None, doubt=doubt,
                    alone_deg=free)  # fmt: skip
+
+
+def _scaled(of: Spread, by: float) -> Spread:
+    """An axis so many times less sure, and as much its place and states."""
+    return replace(of, axis_deg=by * of.axis_deg, point=by * of.point, q=by * of.q)
 
 
 @dataclass(frozen=True)

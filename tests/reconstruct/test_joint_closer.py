@@ -95,3 +95,12 @@ def test_what_points_up_to_the_rims_show_counts_and_is_doubtful(fit, found):
 )  # fmt: skip
 def test_what_they_know_no_better_does_not(fit, found):
     assert given(fit, found) == (FIRST, fit)
+
+
+@pytest.mark.parametrize("slide, counts", [(0.63, False), (0.95, True)])
+def test_another_type_counts_only_if_both_make_it_the_more_probable(slide, counts):
+    hinge = replace(joint("ambiguous", 40.0), type_probability={"revolute": 0.81, "prismatic": 0.19})
+    found = replace(joint("ok", 6.0, "prismatic"), type_probability={"revolute": 1 - slide, "prismatic": slide})
+    used, answer = given(hinge, found)
+    assert (used is CLOSER) == counts
+    assert answer.type == ("prismatic" if counts else "revolute")

@@ -96,6 +96,37 @@ def test_an_axis_that_goes_along_no_edge_is_left_as_the_tracks_have_it(seed):
     assert along_edges(joint, pictures(BOX)) is joint
 
 
+def dragged(joint: Finished, px: float, seed: int) -> Finished:
+    """The joint that its tracks hold if a third of them slides along, by about so many px."""
+    rng, s = np.random.default_rng(seed + 100), joint.sight
+    along = (np.sin(np.linspace(0, np.pi / 2, T)) ** 2)[:, None] * np.array([0.76, 0.64])
+    uv = s.uv.copy()
+    uv[:18] += px * rng.uniform(0.5, 1.5, (18, 1, 1)) * along
+    sight = replace(s, uv=uv)
+    b = polish(joint.bundle, sight, iterations=40)
+    return replace(joint, bundle=b, sight=sight, spread=spread(b, sight))
+
+
+@pytest.mark.parametrize("px, seed", [(1.0, 0), (1.0, 1), (1.5, 0), (1.5, 2)])
+def test_tracks_that_slide_alike_do_not_outweigh_edges_by_their_own_word(px, seed):
+    joint = dragged(door(BOX[1], 5.0, noise=0.1, seed=seed), px, seed)
+    assert off_deg(joint, BOX[1]) > 2 * joint.axis_deg, "it is sure, and wrong"
+    out = along_edges(joint, pictures(BOX))
+    assert off_deg(out, BOX[1]) < 0.5 * off_deg(joint, BOX[1])
+    assert off_deg(out, BOX[1]) < 2 * out.axis_deg
+    assert out.alone_deg >= joint.axis_deg
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_they_hold_is_stated_no_better_than_it_is_far_from_a_more_probable_edge(seed):
+    joint = dragged(door(BOX[1], 4.0, noise=0.1, seed=seed), 1.5, seed)
+    assert off_deg(joint, BOX[1]) > 4 * joint.axis_deg
+    out = along_edges(joint, pictures(BOX))
+    assert out.bundle is joint.bundle
+    assert off_deg(out, BOX[1]) < 2 * out.axis_deg
+    assert np.all(out.spread.q >= joint.spread.q) and out.spread.point > joint.spread.point
+
+
 def test_what_tracks_hold_and_slides_are_not_asked():
     joint = door(BOX[1], 60.0, noise=0.05)
     assert joint.axis_deg < WORTH_DEG and along_edges(joint, pictures(BOX)) is joint
