@@ -97,7 +97,8 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
     lit = ask(without(tracks, may)) if asked else again
     confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
-    if share >= SOME_SHADOWS and not confirmed and _sharper(lit, again):
+    few = lit.inliers < FEW * max(fit.inliers, again.inliers)
+    if share >= SOME_SHADOWS and not confirmed and not few and _sharper(lit, again):
         twice_sure = fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit)
         words = f"without what may be on a shadow, {lit.reason}"
         return replace(lit, verdict="ambiguous" if twice_sure else "ok", reason=words)
