@@ -42,6 +42,10 @@ CONSTANTS = FREE_DEPTH + 1
 
 # Of the hand of spheres, PointsRows: N/m, N s/m, s ahead, N a sphere's axis, N in all, 1/s (0: targets jump).
 STIFFNESS, DAMPING, AHEAD, SPHERE_FORCE, TOTAL_FORCE, RATE = range(6)
+HELD = 1.0
+"""N that pull a sphere which something holds back; landmarks that jitter pull free ones by 0.3 at a step's end."""
+DRAWN = 10.0
+"""How many times more (squared) the force counts of a sphere whose target was drawn in before: the limit made it so."""
 BAD = 3
 """Of the kinds of MuJoCo's warnings (mjtWarning), the first of three of a state that is not finite: it begins anew."""
 
@@ -152,30 +156,46 @@ def aims(ids, action, numbers, qpos, times, table, constants, aim):
             aim[row, s, 2] = x * m[2] + y * m[5] + z * m[8] + m[11]
 
 
-@_compiled(_ids, _r3, _r3, _r3, _f3, _f3, _r1)
-def drive(ids, aim, here, speed, target, velocity, hand):
+@_compiled(_ids, _r3, _f3, _r3, _r3, _f3, _f3, _r1)
+def drive(ids, aim, before, here, speed, target, velocity, hand):
     """Write velocities (n, S, 3) of the spheres' targets that take them to where they are aimed at, or (rate 0) the
     targets themselves, drawn in where the forces that can be foreseen would add up to too much; see the numbers of
-    ``hand`` above."""
+    ``hand`` above.
+
+    What is foreseen of a sphere is the force if it went on as fast as it goes. In a step of several substeps that
+    counts only where something holds it back: it is pulled by HELD or more, or its target was drawn in by as much from
+    where it was aimed at ``before``, which is set to ``aim``. A free one is as fast as its target within a few
+    milliseconds, and its force is gone before the step's end.
+    """
     stiffness, limit, rate = hand[STIFFNESS], hand[SPHERE_FORCE], hand[RATE]
     lag = stiffness * hand[AHEAD] + hand[DAMPING]
+    count = aim.shape[1]
+    counts = np.empty(count)  # whether a sphere is held back, 0 to 1
     for row in ids:
         total = 0.0
-        for s in range(aim.shape[1]):
-            square = 0.0
+        for s in range(count):
+            square = now = short = 0.0
             for k in range(3):
                 pull = (aim[row, s, k] - here[row, s, k]) * stiffness - lag * speed[row, s, k]
                 pull = _clip(pull, -limit, limit)
                 square += pull * pull
-            total += sqrt(square)
+                pull = (target[row, s, k] - here[row, s, k]) * stiffness - hand[DAMPING] * speed[row, s, k]
+                now += pull * pull
+                pull = (before[row, s, k] - target[row, s, k]) * stiffness
+                short += pull * pull
+                before[row, s, k] = aim[row, s, k]
+            held = (now + min(short, DRAWN * now)) / (HELD * HELD)
+            counts[s] = 1.0 if rate == 0.0 else min(1.0, held * held)
+            total += counts[s] * sqrt(square)
         share = hand[TOTAL_FORCE] / total if total > hand[TOTAL_FORCE] else 1.0
-        for s in range(aim.shape[1]):
+        for s in range(count):
+            of_it = 1.0 - (1.0 - share) * counts[s]
             for k in range(3):
                 to = aim[row, s, k]
                 if share < 1.0:
                     drag = lag * speed[row, s, k]
                     pull = _clip((to - here[row, s, k]) * stiffness - drag, -limit, limit)
-                    to = here[row, s, k] + (pull * share + drag) / stiffness
+                    to = here[row, s, k] + (pull * of_it + drag) / stiffness
                 if rate == 0.0:
                     target[row, s, k], velocity[row, s, k] = to, 0.0
                 else:

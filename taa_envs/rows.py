@@ -174,6 +174,7 @@ class PointsRows:
 
     Attributes:
         weights: (S, 21), targets are ``weights @ landmarks``; the first 21 are the landmarks.
+        aimed: (n, S, 3) m, where the spheres were last aimed at.
     """
 
     def __init__(self, controller: PointsController, rows: Rows) -> None:
@@ -191,7 +192,8 @@ class PointsRows:
         self._here, self._speed = view(rows.qpos, controller.qpos), view(rows.qvel, controller.dof)
         self._velocity, self._target = view(rows.ctrl, controller.ctrl), view(rows.act, controller.target)
         self._landmarks, self._landmark_speed = self._here[:, :21], self._speed[:, :21]
-        self._states = self._here, self._speed, self._target, self._velocity
+        self.aimed = np.zeros((rows.n, count, 3))
+        self._states = self.aimed, self._here, self._speed, self._target, self._velocity
         hand, self._everyone = controller.hand, np.arange(rows.n)
         self._jump, self._glide = (
             np.array([hand.stiffness, hand.damping, ahead, hand.sphere_force, hand.total_force, rate])
@@ -203,7 +205,7 @@ class PointsRows:
 
     def place(self, ids: np.ndarray, joints: np.ndarray) -> None:
         """Put the hands at landmarks (n, 21, 3) m, at rest."""
-        self._here[ids] = self._target[ids] = self.weights @ joints
+        self._here[ids] = self._target[ids] = self.aimed[ids] = self.weights @ joints
         self._speed[ids] = self._velocity[ids] = 0.0
 
     def control(self, target: np.ndarray) -> None:
@@ -213,8 +215,8 @@ class PointsRows:
     def advance(self, target: np.ndarray, ids: np.ndarray | None) -> None:
         """One environment step, in which the targets move evenly to targets (n, S, 3) m.
 
-        The whole hand's limit holds for the forces at the step's end as they can be foreseen, each sphere going on as
-        fast as it goes: where it binds, the targets move to where the hand just keeps it.
+        The whole hand's limit holds for the forces at the step's end as they can be foreseen, each sphere that is held
+        back going on as fast as it goes: where it binds, the targets move to where the hand just keeps it.
         """
         kernels.drive(self._everyone if ids is None else ids, target, *self._states, self._glide)
         self._rows.step(ids, SUBSTEPS)
@@ -232,31 +234,31 @@ class ControllerRows:
     """Any other hand, one simulation only, through its :class:`taa_envs.hands.Controller`; targets are landmarks.
 
     Attributes:
-        aim: (21, 3) m, the landmarks that the last step ended aiming at.
+        aimed: (1, 21, 3) m, the landmarks that the last step ended aiming at.
     """
 
     def __init__(self, controller: Controller, rows: SingleRows) -> None:
         self.weights = np.eye(21)
         self._controller, self._rows, self._data = controller, rows, rows.data
-        self._velocity, self.aim = np.zeros((1, 21, 3)), np.zeros((21, 3))
+        self._velocity, self.aimed = np.zeros((1, 21, 3)), np.zeros((1, 21, 3))
 
     def targets(self, joints: np.ndarray) -> np.ndarray:
         return joints
 
     def place(self, ids: np.ndarray, joints: np.ndarray) -> None:
         self._controller.place(self._data, joints[0])
-        self.aim = joints[0].copy()
+        self.aimed[:] = joints
 
     def control(self, target: np.ndarray) -> None:
         self._controller.control(self._data, target[0])
 
     def advance(self, target: np.ndarray, ids: np.ndarray | None) -> None:
         """One environment step, in which the landmarks aimed at move evenly to others (1, 21, 3) m."""
-        way = target[0] - self.aim
+        way = target[0] - self.aimed[0]
         for k in range(SUBSTEPS):
-            self._controller.control(self._data, self.aim + (k / SUBSTEPS) * way)
+            self._controller.control(self._data, self.aimed[0] + (k / SUBSTEPS) * way)
             self._rows.step(None)
-        self.aim = target[0].copy()
+        self.aimed[:] = target
 
     def landmarks(self) -> np.ndarray:
         return self._controller.landmarks(self._data)[None]

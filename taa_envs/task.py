@@ -25,7 +25,7 @@ from taa_envs.reward import (
     goal_reward,
     reward_scales,
 )
-from taa_envs.rows import ControllerRows, Rows, hand_rows
+from taa_envs.rows import Rows, hand_rows
 from taa_envs.scene import Scene, touch_columns
 
 ABSOLUTES = 63
@@ -299,8 +299,7 @@ class Task:
         for name in self.EPISODE:
             getattr(self, name)[row] = state["episode"][name]
         self.rows.restore(row, np.asarray(state["simulation"]))
-        if isinstance(self._hand, ControllerRows):
-            self._hand.aim = self._aim[row].copy()
+        self._hand.aimed[row] = self._aim[row]
         self._look(np.array([row]))
 
 

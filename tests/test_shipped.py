@@ -11,7 +11,9 @@ import pytest
 
 from taa_envs import gate
 from taa_envs.asset import load_asset
+from taa_envs.env import ArticulationEnv
 from taa_envs.registry import shipped_folder
+from taa_envs.replay import replay
 
 FOLDERS = sorted(f.parent for f in shipped_folder().glob("*/asset.json"))
 README = Path(__file__).resolve().parents[1] / "assets" / "README.md"
@@ -37,3 +39,19 @@ def test_each_passes_the_gate_again_and_is_what_it_says(folder):
     q = asset.reference.q
     assert low <= q.min() + 1e-6 and q.max() <= high + 1e-6 and np.ptp(q) > 0
     assert asset.provenance["moving.mass"]["origin"] == "assumed" and (folder / "preview.png").is_file()
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: f.name)
+def test_a_zero_action_is_its_replay_and_succeeds(folder):
+    asset = load_asset(folder)
+    run = replay(asset, controls=False).trajectory
+    env = ArticulationEnv(asset)
+    env.reset(seed=0)
+    progress, info = [], {}
+    while len(progress) < 1.5 * asset.end_time / 0.02 and not info.get("is_success"):
+        info = env.step(np.zeros(env.action_space.shape, np.float32))[-1]
+        progress.append(info["joint_progress"])
+    assert info["is_success"]
+    t = 0.02 * np.arange(1, len(progress) + 1)
+    shown = np.clip(np.interp(t, run.time, asset.stroke_fraction(run.q)), 0, 1)
+    assert np.abs(shown - progress).max() < 0.05
