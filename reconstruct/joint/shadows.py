@@ -56,11 +56,11 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     that its tracks follow far more exactly, or where nothing was found any that is no shadow's, and any that
     contradicts the joint makes it doubtful. Then without all that may be on one, where that is much of what still
     agrees; a sure answer counts that its tracks follow no less exactly, unless it confirms the joint and knows the axis
-    no better. It is asked so as well where much of the joint was on edges and some of what is left may be; any sure
-    answer that contradicts it makes the joint doubtful. What counts is doubtful too where a sure one with all
-    contradicts it beside a doubtful one. Where more of the tracks off the edges follow the first joint, and no less
-    exactly, than another that is found among these, the more exact one counts and is doubtful. In a grey world only
-    many edges are asked of.
+    no better, or both before are doubtful and many times as many tracks follow them. It is asked so as well where much
+    of the joint was on edges and some of what is left may be; any sure answer that contradicts it makes the joint
+    doubtful. What counts is doubtful too where a sure one with all contradicts it beside a doubtful one. Where more of
+    the tracks off the edges follow the first joint, and no less exactly, than another that is found among these, the
+    more exact one counts and is doubtful. In a grey world only many edges are asked of.
 
     Where nothing is found without the edges, a joint is refused if nearly all of it are such edges or it is doubtful by
     itself, else ambiguous; of these two the second, and a sure one in its place, where one of the same type is found
@@ -97,7 +97,7 @@ def unless_a_shadow(fit: JointFit, video: Video, tracks: Tracks, ask: Callable[[
     asked = share >= SOME_SHADOWS or (many and (_doubtful(again) or share >= HARDLY_SHADOWS))
     lit = ask(without(tracks, may)) if asked else again
     confirmed = share >= SOME_SHADOWS and _confirms(lit, again)
-    few = lit.inliers < FEW * max(fit.inliers, again.inliers)
+    few = _doubtful(fit) and _doubtful(again) and lit.inliers < FEW * max(fit.inliers, again.inliers)
     if share >= SOME_SHADOWS and not confirmed and not few and _sharper(lit, again):
         twice_sure = fit.verdict == "ok" and _doubtful(again) and contradicts(lit, fit)
         words = f"without what may be on a shadow, {lit.reason}"
