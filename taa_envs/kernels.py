@@ -45,7 +45,7 @@ STIFFNESS, DAMPING, AHEAD, SPHERE_FORCE, TOTAL_FORCE, RATE = range(6)
 HELD = 1.0
 """N that pull a sphere which something holds back; landmarks that jitter pull free ones by 0.3 at a step's end."""
 DRAWN = 10.0
-"""How many times more (squared) the force counts of a sphere whose target was drawn in before: the limit made it so."""
+"""By how many times its own a sphere's squared force counts more, at most, where the limit drew its target in."""
 BAD = 3
 """Of the kinds of MuJoCo's warnings (mjtWarning), the first of three of a state that is not finite: it begins anew."""
 
@@ -163,14 +163,14 @@ def drive(ids, aim, before, here, speed, target, velocity, hand):
     ``hand`` above.
 
     What is foreseen of a sphere is the force if it went on as fast as it goes. In a step of several substeps that
-    counts only where something holds it back: it is pulled by HELD or more, or its target was drawn in by as much from
-    where it was aimed at ``before``, which is set to ``aim``. A free one is as fast as its target within a few
-    milliseconds, and its force is gone before the step's end.
+    counts only where something holds it back: it is pulled by HELD or more, or by a third of that while its target
+    stands as far short of where it was aimed at before, ``before`` (n, S, 3) m, which is set to ``aim``. A free one is
+    as fast as its target within a few milliseconds, and its force is gone before the step's end.
     """
     stiffness, limit, rate = hand[STIFFNESS], hand[SPHERE_FORCE], hand[RATE]
     lag = stiffness * hand[AHEAD] + hand[DAMPING]
     count = aim.shape[1]
-    counts = np.empty(count)  # whether a sphere is held back, 0 to 1
+    counts = np.empty(count)  # how much of a sphere's force counts, 0 to 1
     for row in ids:
         total = 0.0
         for s in range(count):

@@ -231,7 +231,7 @@ def along_edges(done: Finished, pictures: Pictures) -> Finished:
     axis_deg = float(np.hypot(np.sqrt(2) * parallel_deg(sight), others))
     if away > APART_STDS * free:
         # An axis so far from a more probable one is known no better than the two of them are apart.
-        own = float(np.sqrt(p @ np.append([apart_deg(a.bundle, b) for a in asked], free) ** 2))
+        own = float(np.sqrt(p @ (np.append([apart_deg(a.bundle, b) for a in asked], free) ** 2)))
         if axis_deg >= own:
             return replace(done, spread=replace(_scaled(done.spread, own / free), axis_deg=own))
         free = max(free, away / APART_STDS)
